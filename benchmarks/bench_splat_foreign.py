@@ -42,7 +42,7 @@ from twin.scene.foundation.find import View, look_at, viewed
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 from twin.scene.rebuild.run import rebuild
 from twin.scene.semantics.lift import Viewpoint, render_labels
-from twin.scene.settings import FitConfig, FrameConfig, RebuildConfig
+from twin.scene.settings import FitConfig, RebuildConfig
 from twin.scene.store.folder import read_scene
 
 IMAGES = 100
@@ -53,7 +53,6 @@ FOLDERS = {
     "study": "rgbd_sun3d_studyroom_a",
 }
 NO_IMAGE = np.zeros((1, 1, 3), dtype=np.uint8)
-FRAMES = {"kitchen": FrameConfig(train_every=5, holdout_every=5, max_holdout_frames=4)}
 LIST = ROOT / "benchmarks" / "semantics" / "kitchen_objects.json"
 QUESTIONS = LIST.with_name("questions.json")
 
@@ -104,12 +103,11 @@ def shelf_truth(_folder: Path) -> Truth:
 TRUTHS = {"kitchen": kitchen_truth, "shelf": shelf_truth}
 
 
-def rebuilt(name: str, source: Path, folder: Path) -> tuple[RunFolder, SemanticScene, float]:
+def rebuilt(source: Path, folder: Path) -> tuple[RunFolder, SemanticScene, float]:
     """Import and rebuild; the things found, and the CPU seconds of all of it."""
     began = time.process_time()
     run = RunFolder.open(folder) if folder.is_dir() else shelf_scan(source, folder)
-    frames, fit = FRAMES.get(name, FrameConfig()), FitConfig(iterations=IMAGES, threads=1)
-    record = rebuild(run, RebuildConfig(frames=frames, fit=fit), QUIET)
+    record = rebuild(run, RebuildConfig(fit=FitConfig(iterations=IMAGES, threads=1)), QUIET)
     rows = {BACKGROUND_KEY: record["background"]["num_splats"]}
     return run, read_semantics(run.scene_dir, rows), time.process_time() - began
 
@@ -166,7 +164,7 @@ def question_rows(keep: Path, demo: Path | None) -> list[Target]:
         if (demo if source is None else source.is_dir() or None) is None:
             print(f"splat_foreign: no {name} here (GST_SHARED_DATA, --demo); not asked about")
             continue
-        run = RunFolder.open(demo) if source is None else rebuilt(name, source, keep / name)[0]
+        run = RunFolder.open(demo) if source is None else rebuilt(source, keep / name)[0]
         rows, num = asked(about, run, source), len(about["questions"])
         told.append(f"{name} {right_of(rows[:num])}")
         answers, later = answers + rows[:num], later + rows[num:]
@@ -194,7 +192,7 @@ def judged(run: RunFolder, scene: SemanticScene, truth: Truth) -> Judged:
 
 def rows_of(name: str, source: Path, folder: Path) -> list[Target]:
     """Found and false per object, and one printed line for each object and each false thing."""
-    run, scene, seconds = rebuilt(name, source, folder)
+    run, scene, seconds = rebuilt(source, folder)
     truth = TRUTHS[name](source)
     result = judged(run, scene, truth)
     names = {item.id: item.name for item in scene.instances}
