@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import ndimage
 
 from bridge.geometry import se3
@@ -95,18 +95,17 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
     Said only where two halves of the views say the same.
     """
     some = spread(np.arange(len(views)), EDGE_VIEWS)
-    sides = np.stack([_meeting(views[k], np.asarray, GRID_PX) for k in some])
+    edges = [_edges_of(_grey(view.half)) for view in views]
+    jumps = [_jumps_of(view.half.depth_m) for view in views]
+    sides = np.stack([_meeting(edges[k], jumps[k], GRID_PX) for k in some])
     each = sides.sum(axis=1)
     maps = each.mean(axis=0)
     for word, turn in TURNED.items():
-        turned = np.stack([_meeting(views[k], turn, GRID_PX).sum(axis=0) for k in some])
+        turned = np.stack([_meeting(turn(edges[k]), jumps[k], GRID_PX).sum(axis=0) for k in some])
         if _is_sure(turned) and turned.mean(axis=0).max() > LEAST_GAIN**2 * maps.max():
             return [f"its colour images are {word} to its depth"]
     flows = np.array([_flow_px_s(view, pose_at) for view in views])
-    late = np.stack([
-        _meeting(view, np.asarray, DELAYS_S[:, None] * flow).sum(axis=0)
-        for view, flow in zip(views, flows, strict=True)
-    ])  # fmt: skip
+    late = np.stack([*map(_meeting, edges, jumps, flows[:, None] * DELAYS_S[:, None])]).sum(axis=1)
     best, *parts = (int(part.mean(axis=0).argmax()) for part in (late, late[::2], late[1::2]))
     gain = late[:, best] - late[:, len(DELAYS_S) // 2]
     delay_s, differ_s = float(DELAYS_S[best]), abs(float(np.diff(DELAYS_S[parts])[0]))
@@ -153,22 +152,25 @@ def _flow_px_s(view: TrainingView, pose_at: PoseAt) -> Float[np.ndarray, "2"]:
     return np.median(moved, axis=0) / (2e-9 * STEP_NS) if front.any() else np.zeros(2)
 
 
-def _meeting(
-    view: TrainingView, turn: Callable[[np.ndarray], np.ndarray], shifts_px: np.ndarray
-) -> Float[np.ndarray, "2 num_shifts"]:
-    """How strong an image's edges are at depth's in its left and right half, for each shift."""
-    target = view.half
-    edges = ndimage.gaussian_gradient_magnitude(turn(_grey(target)), 1.0)
-    edges = np.minimum(edges / max(float(np.quantile(edges, 0.9)), 1e-6), 1.0)
-    behind_m = ndimage.maximum_filter(target.depth_m, GAP_PX)
-    depth_m = np.where(target.depth_m > 0, target.depth_m, behind_m)
-    near = ndimage.minimum_filter(depth_m, footprint=[[1, 1], [1, 0]], origin=-1)
-    far = ndimage.maximum_filter(depth_m, footprint=[[1, 1], [1, 0]], origin=-1)
-    rows, columns = np.nonzero((near > 0) & (far - near > JUMP * near))
-    thinner = max(1, len(rows) // MOST_EDGES)
-    rows, columns = rows[::thinner], columns[::thinner]
-    right, steps = columns >= edges.shape[1] // 2, np.rint(shifts_px).astype(int)
-    margin = int(np.abs(steps).max())
+def _edges_of(grey: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """How strong an image's edges are, up to 1."""
+    edges = ndimage.gaussian_gradient_magnitude(grey, 1.0)
+    return np.asarray(np.minimum(edges / max(float(np.quantile(edges, 0.9)), 1e-6), 1.0))
+
+
+def _jumps_of(depth_m: Float[np.ndarray, "height width"]) -> Int[np.ndarray, "2 num_jumps"]:
+    """Rows and columns of some pixels at which depth jumps."""
+    filled_m = np.where(depth_m > 0, depth_m, ndimage.maximum_filter(depth_m, GAP_PX))
+    near = ndimage.minimum_filter(filled_m, footprint=[[1, 1], [1, 0]], origin=-1)
+    far = ndimage.maximum_filter(filled_m, footprint=[[1, 1], [1, 0]], origin=-1)
+    jumps = np.array(np.nonzero((near > 0) & (far - near > JUMP * near)))
+    return jumps[:, :: max(1, jumps.shape[1] // MOST_EDGES)]
+
+
+def _meeting(edges: np.ndarray, jumps: np.ndarray, shifts_px: np.ndarray) -> np.ndarray:
+    """How strong edges are where depth jumps, left and right of the middle, for each shift."""
+    (rows, columns), steps = jumps, np.rint(shifts_px).astype(int)
+    right, margin = columns >= edges.shape[1] // 2, int(np.abs(steps).max())
     edges = np.pad(edges, margin, mode="reflect")
     found = np.array([edges[rows + y + margin, columns + x + margin] for x, y in steps])
     return np.asarray(np.stack([~right, right]).astype(found.dtype) @ found.T) / max(len(rows), 1)
