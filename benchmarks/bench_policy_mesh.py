@@ -140,7 +140,7 @@ def main() -> None:
     alike = {name: both["recorded"] == both[name] for name in ("splats", "shapes")}
     table: dict[str, Any] = {"alike": {name: int(each.sum()) for name, each in alike.items()}}
     targets = []
-    for name, sim in (("splats", rates["splats"]), ("shapes", rates["shapes"])):
+    for name, sim in rates[[*alike]].items():
         r, rank = pearson(rates["recorded"], sim), mmrv(recorded=rates["recorded"], sim=sim)
         targets.append(Target(what=f"r, {name}", measured=r, limit=0.85, at_most=False))
         targets.append(Target(what=f"MMRV, {name}", measured=rank, limit=0.05))

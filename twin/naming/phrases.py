@@ -168,7 +168,8 @@ class Asker:
             sized = [item for item in pool if all(self._has_size(item, w, pool) for w in sizes)]
             fit = [[item for item in sized if wanted <= set(map(colour_of, words_of(item.label)))]]
             seen = [replace(o, score=NEARLY * o.score) for o in sized if o.source != NAMED]
-            fit += [[o for o in seen if wanted <= near_colours(o.color_srgb)[k]] for k in (0, 1)]
+            near = [(o, near_colours(o.color_srgb)) for o in seen]
+            fit += [[o for o, names in near if wanted <= names[k]] for k in (0, 1)]
             for best in filter(None, fit):
                 return [Found(item=item, score=item.score) for item in best], ""
         return [], f"there is {labels}"

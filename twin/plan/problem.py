@@ -26,8 +26,6 @@ Joints = Float[np.ndarray, " num_joints"]
 Postures = Float[np.ndarray, "_ num_joints"]
 Vector = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]
-Spheres = Float[np.ndarray, "_ 4"]
-"""Centre and radius [m]."""
 Numbers = Float[np.ndarray, " _"]
 Flags = Bool[np.ndarray, " _"]
 Ids = Int[np.ndarray, " _"]

@@ -19,7 +19,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import PostureTrack
-from twin.scene.localise.held import BETWEEN_M, Grip, executions_ns, grips_between
+from twin.scene.localise.held import Grip, executions_ns, grips_between, reach_m
 from twin.scene.shape.known import turned_alike
 
 FELL_M = 0.05
@@ -166,8 +166,7 @@ def _while_near(
     stamps = range(*span_ns, STEP_NS)
     tool_m = [robot.T_base_tcp(track.at(ns).joints_rad)[:3, 3] for ns in stamps]
     away_m = [np.linalg.norm(tool_m - each[:3, 3], axis=1) for each in (T, after)]
-    reach_m = BETWEEN_M + max(model.size_m) / 2
-    old, new = (np.flatnonzero(each < reach_m) for each in away_m)
+    old, new = (np.flatnonzero(each < reach_m(model)) for each in away_m)
     pushed = len(old) and len(new) and new[-1] > old[0]
     return replace(at_end, start_ns=stamps[old[0]], end_ns=stamps[new[-1]]) if pushed else at_end
 
@@ -201,7 +200,7 @@ def _carried(
         T_hand = se3.invert(grip.T_base_tcp_start) @ T
         if grip.start_ns in held:
             T_hand = turned_alike(held[grip.start_ns], T_hand, model)
-        if np.linalg.norm(T_hand[:3, 3]) < BETWEEN_M + max(model.size_m) / 2:
+        if np.linalg.norm(T_hand[:3, 3]) < reach_m(model):
             start_ns, taken = grip.start_ns, grip.T_base_tcp_start @ T_hand
             spans += [
                 _Span(start_ns=grip.closing_ns, end_ns=start_ns, T_start=T, T_end=taken),

@@ -35,7 +35,7 @@ from twin.scene.localise.points import MIN_POINTS, fuse_stationary, object_point
 from twin.scene.localise.stationary_frames import Poses
 
 BETWEEN_M = 0.03
-"""An object this near to the tool, beside half its largest side, is between the fingers."""
+"""From the surface of what is between the fingers to the tool, at most."""
 PLATEAU_M = 0.003
 """Fingers that are this near to the least opening of a grasp grasp what is between them."""
 OPENS_M = 0.0005
@@ -65,6 +65,11 @@ class Grip:
     end_ns: int
     T_base_tcp_start: Float[np.ndarray, "4 4"]
     T_base_tcp_end: Float[np.ndarray, "4 4"]
+
+
+def reach_m(model: ObjectModel) -> float:
+    """From the tool: nearer than this an object is between the fingers."""
+    return BETWEEN_M + max(model.size_m) / 2
 
 
 def executions_ns(episode: Episode) -> dict[str, tuple[int, int]]:
@@ -137,8 +142,7 @@ def held_objects(
         for name, surface in shapes.items():
             model = task.objects[name]
             away_m = last_seen_m.get(name, np.inf) - grip.T_base_tcp_start[:3, 3]
-            is_near = np.linalg.norm(away_m) < BETWEEN_M + max(model.size_m) / 2
-            may_be = is_near or model.soft is None
+            may_be = model.soft is None or np.linalg.norm(away_m) < reach_m(model)
             if may_be and (T := fitted_in_hand(frames, task, model, surface)) is not None:
                 yield name, grip, T
 
@@ -174,8 +178,8 @@ def fitted_in_hand(
 ) -> Float[np.ndarray, "4 4"] | None:
     """Pose ``T_tcp_object`` of an object between the fingers; None where none is seen there."""
     views = fuse_stationary(frames, FRAMES, FRAMES, replace(task, start={}))
-    reach_m = BETWEEN_M + float(np.linalg.norm(model.size_m)) / 2
-    near = object_points(views, model, -np.inf, lambda p: lengths(p) >= reach_m)
+    around_m = BETWEEN_M + float(np.linalg.norm(model.size_m)) / 2
+    near = object_points(views, model, -np.inf, lambda p: lengths(p) >= around_m)
     if not near or len(near[0]) < MIN_POINTS:
         return None
     fit = fit_mesh(near[0], views, surface, tilt_sigma_rad=ANY_TILT_RAD, lying=True)

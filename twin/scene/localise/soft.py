@@ -70,8 +70,6 @@ SCORE_M = 0.2
 """In the assignment, a point of score counts like this distance."""
 MIN_MARGIN_M = 0.02
 """Equal toys whose exchange would cost less are reported as hardly told apart."""
-
-
 STANDS = 0.9
 """Cosine of the tilt up to which the underside of a toy is taken to be level."""
 

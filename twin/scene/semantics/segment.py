@@ -40,6 +40,9 @@ SAME_IOU = 0.6
 """Two things are one when they share this much of their union."""
 MAX_TAKEN = 0.3
 """Share of a thing that a stabler one may have."""
+FACES_DOWN, MOSTLY, LAYER_M = -0.3, 1 / 3, 0.02
+"""z of normals that a camera above seldom sees, and the share of a layer of a thing from which it
+is the thing's image in a shining floor."""
 ROUGHNESS_FACTOR = 3.0
 """Things are higher over the plane than so many times its roughness, as it was measured."""
 FINEST_VOXEL_M, WALL_VOXEL_M = 0.004, 0.008
@@ -76,10 +79,6 @@ class Segmentation:
     remark: str
     """Why nothing was found; empty otherwise."""
 
-
-FACES_DOWN, MOSTLY, LAYER_M = -0.3, 1 / 3, 0.02
-"""z of normals that a camera above seldom sees, and the share of a layer of a thing from which it
-is the thing's image in a shining floor."""
 
 Look = tuple[Int[np.ndarray, " num_points"], float]
 """What belongs together, seen with voxels of one size: index of each point's thing plus one, the
