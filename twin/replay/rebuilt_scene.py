@@ -55,7 +55,12 @@ def calibrated(
         return config
     wanted, nominal = config.physics, PhysicsConfig()
     names = {item.name for item in fields(PhysicsConfig)}
-    known = {k: v for k, v in _identified(calibration.record, "value").items() if k in names}
+    found, sigmas = (_identified(calibration.record, key) for key in ("value", "sigma_log"))
+    rubs = [] if task is None else _weighed(calibration, task, "friction")
+    if len(rubs) == 1:  # a world has one
+        ((_, pair, sigmas["surface_friction"]),) = rubs
+        found["surface_friction"] = pair / wanted.object_friction
+    known = {k: v for k, v in found.items() if k in names}
     free = {
         name: type(getattr(nominal, name))(value)
         for name, value in known.items()
@@ -64,9 +69,7 @@ def calibrated(
     physics = replace(wanted, **free)
     taken = {name for name, value in known.items() if getattr(physics, name) == value}
     spreads = tuple(
-        (name, spread)
-        for name, spread in sorted(_identified(calibration.record, "sigma_log").items())
-        if name in taken and spread >= 0
+        (name, spread) for name, spread in sorted(sigmas.items()) if name in taken and spread >= 0
     )
     variation = replace(config.variation, calibrated=spreads)
     if task is not None:
@@ -87,13 +90,21 @@ def posterior_of(calibration: Calibration, task: Task) -> tuple[PosteriorDraw, .
 
 def masses_of(calibration: Calibration | None, task: Task) -> dict[str, tuple[float, float]]:
     """Masses [kg] of a task's objects that trials weighed, with the spread of the logarithm."""
+    return {name: (mass, spread) for name, mass, spread in _weighed(calibration, task)}
+
+
+def _weighed(
+    calibration: Calibration | None, task: Task, part: str = ""
+) -> list[tuple[str, float, float]]:
+    """Names and what trials showed of these objects: the mass, or a part of what pushes showed."""
     record = {} if calibration is None else calibration.record
-    found = _mapping(_mapping(_mapping(record, MASSES), "tasks"), task.name)
-    return {
-        name: (item["value"], item["sigma_log"])
-        for name, item in found.items()
-        if name in task.objects and not item["why"]
-    }
+    items = _mapping(_mapping(_mapping(record, MASSES), "tasks"), task.name)
+    found = ((name, item.get(part) if part else item) for name, item in items.items())
+    return [
+        (name, x["value"], x["sigma_log"])
+        for name, x in found
+        if name in task.objects and x and "value" in x and not x.get("why")
+    ]
 
 
 def for_task(config: ReplayConfig, calibration: Calibration | None, task: Task) -> ReplayConfig:
