@@ -115,14 +115,12 @@ def _refusals(root: ET.Element) -> Iterator[str]:
                 yield f"the link {link.get('name')!r} with a {shape.tag} of size {told}"
 
 
-def _replace_capsules(root: ET.Element) -> bool:
+def _replace_capsules(root: ET.Element) -> None:
     """Put the cylinder around each capsule of collision, which readers of URDF pass over."""
-    capsules = [shape for link in root for shape in link.findall("collision/geometry/capsule")]
-    for shape in capsules:
+    for shape in root.findall("link/collision/geometry/capsule"):
         radius, length = (number_of(shape.get(key, "")) for key in ("radius", "length"))
         shape.tag = "cylinder"
         shape.set("length", repr(length + 2 * radius))
-    return bool(capsules)
 
 
 _SAME_FRAME = 1e-6
@@ -144,7 +142,7 @@ def _with_limits(urdf: str, record: Robot) -> str:
             "shapes with three extents above 0.",
         )
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
-    changed = _replace_capsules(root)
+    _replace_capsules(root)
     for index, name in enumerate(record.joints):
         found = joints.get(name)
         if found is None:
@@ -163,8 +161,7 @@ def _with_limits(urdf: str, record: Robot) -> str:
                 element = ET.SubElement(found, "limit", effort="0", velocity="0")
             for key, value in limits.items():
                 element.set(key, repr(value))
-            changed = True
-    return ET.tostring(root, encoding="unicode") if changed else urdf
+    return ET.tostring(root, encoding="unicode")
 
 
 def _rooted(urdf: str, T_base_root: Float[np.ndarray, "4 4"]) -> str:
