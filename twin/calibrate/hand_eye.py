@@ -39,13 +39,6 @@ def motions(
     return P, Q
 
 
-def solve_hand_eye(
-    Ts_a: Float[np.ndarray, "num_pairs 4 4"], Ts_b: Float[np.ndarray, "num_pairs 4 4"]
-) -> Float[np.ndarray, "4 4"]:
-    """Solve AX = XB for X from the motions between all poses."""
-    return solve_motions(*motions(Ts_a, Ts_b))[0]
-
-
 def solve_motions(
     P: Float[np.ndarray, "num_motions 4 4"],
     Q: Float[np.ndarray, "num_motions 4 4"],
@@ -114,7 +107,7 @@ def solve(
     UndeterminedCameraError for too few pairs, and for rotations about one axis only.
     """
     check_motions(Ts_a)
-    X = solve_hand_eye(Ts_a, Ts_b)
+    X, _ = solve_motions(*motions(Ts_a, Ts_b))
     each, J = Ts_a @ X @ se3.invert(Ts_b), np.zeros((0, 12))
     gaps = np.linalg.norm(each[:, None, :3, 3] - each[None, :, :3, 3], axis=-1)
     Z = each[int(np.argmin(np.median(gaps, axis=1)))]  # the one nearest to all others

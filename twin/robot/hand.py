@@ -4,7 +4,7 @@ For arms that are known from a URDF alone: joints may turn without end, and all 
 angle, which nothing drives.
 """
 
-import xml.etree.ElementTree as ET
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import pinocchio as pin
 from jaxtyping import Float
 
 from twin.robot.collision import collision_geometry, convex_hull, corners_of
-from twin.robot.model import RobotDescriptionError, built, parse_description
+from twin.robot.model import RobotDescriptionError, built, with_absolute_meshes
 
 _PACKAGE = "package://"
 
@@ -27,9 +27,7 @@ class Hand:
             raise RobotDescriptionError(
                 f"is not at {urdf}", "Import the data set again, with its robot folder."
             )
-        root = parse_description(urdf.read_text())
-        _with_local_meshes(root, urdf.parent)
-        text = ET.tostring(root, encoding="unicode")
+        text = with_absolute_meshes(urdf.read_text(), partial(_beside, urdf.parent))
         self._model = model = built(text)
         self._data = model.createData()
         known = list(model.names)[1:]
@@ -39,7 +37,7 @@ class Hand:
                 f"lacks the joints {', '.join(missing)}", f"It has: {', '.join(known)}."
             )
         if not model.existFrame(hand_link):
-            names = ", ".join(link.get("name", "") for link in root.findall("link"))
+            names = ", ".join(frame.name for frame in model.frames if frame.type == pin.BODY)
             raise RobotDescriptionError(f"lacks {hand_link!r}", f"It has: {names}.")
         self._frame = model.getFrameId(hand_link)
         behind = model.subtrees[model.frames[self._frame].parentJoint]
@@ -83,17 +81,12 @@ class Hand:
         return hulls
 
 
-def _with_local_meshes(root: ET.Element, folder: Path) -> None:
-    for link in root.findall("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
-        for mesh in link.iter("mesh"):
-            name = mesh.get("filename", "")
-            local = name.removeprefix(_PACKAGE).partition("/")[2] if _PACKAGE in name else name
-            path = folder / local
-            if not path.is_file():
-                raise RobotDescriptionError(
-                    f"names the mesh {name!r}, which is not at {path}",
-                    "Put it there, or import the data set again with its robot folder.",
-                )
-            mesh.set("filename", str(path))
+def _beside(folder: Path, name: str) -> Path:
+    local = name.removeprefix(_PACKAGE).partition("/")[2] if _PACKAGE in name else name
+    path = folder / local
+    if not path.is_file():
+        raise RobotDescriptionError(
+            f"names the mesh {name!r}, which is not at {path}",
+            "Put it there, or import the data set again with its robot folder.",
+        )
+    return path

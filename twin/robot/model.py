@@ -7,8 +7,9 @@ scratch memory: use it from one thread at a time.
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,14 +51,14 @@ def mimicked(urdf: str) -> tuple[Mimic, ...]:
     return found
 
 
-def with_absolute_meshes(urdf: str) -> str:
+def with_absolute_meshes(urdf: str, resolve: Callable[[str], Path] = resolve_mesh) -> str:
     """Replace ``package://`` URIs by paths; visuals are dropped."""
     root = parse_description(urdf)
     for link in root.findall("link"):
         for visual in link.findall("visual"):
             link.remove(visual)
         for mesh in link.iter("mesh"):
-            mesh.set("filename", str(resolve_mesh(mesh.get("filename", ""))))
+            mesh.set("filename", str(resolve(mesh.get("filename", ""))))
     return ET.tostring(root, encoding="unicode")
 
 

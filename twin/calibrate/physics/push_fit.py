@@ -30,8 +30,6 @@ from twin.scene.store.calibration import write_physics
 
 FINGER_FRICTION = "finger_pair_friction"
 SURFACE_FRICTION = "surface_pair_friction"
-METHOD = "pushes"
-"""Marks the physics part of a calibration that was made here."""
 FINGERS_RAD = np.linspace(0.0, 0.25, 6)
 SURFACE = np.geomspace(0.05, 1.6, 9)
 """Effective friction of box on table."""
@@ -235,7 +233,6 @@ def _record(
             }
     words = "nearer" if promoted else "no nearer"
     return {
-        "method": METHOD,
         "promoted": promoted,
         "why": f"held-out end points are {words} than at nominal friction",
         "engine": ENGINE_VERSION,
