@@ -162,7 +162,7 @@ def _refined(
     Ts_a: np.ndarray, Ts_b: np.ndarray, X: np.ndarray, Z: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "num_residuals 12"]]:
     """X, Z and the derivatives of the misfits, in units of their standard deviations."""
-    inverse = np.repeat(1.0 / np.array(_scales(misfits(Ts_a, Ts_b, X, Z))), 3)
+    inverse = np.repeat(1.0 / _scales(misfits(Ts_a, Ts_b, X, Z)), 3)
 
     def left(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, " num_residuals"]:
         moved = X @ se3.small_motion(step[:6]), Z @ se3.small_motion(step[6:])
@@ -177,13 +177,9 @@ def _lengths(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.norm(r[:, :3], axis=1), np.linalg.norm(r[:, 3:], axis=1)
 
 
-def _scales(r: np.ndarray) -> tuple[float, float]:
+def _scales(r: np.ndarray) -> Float[np.ndarray, "2"]:
     """Standard deviation per axis of translation and rotation, from medians."""
-    distance, angle = _lengths(r)
-    return (
-        max(float(np.median(distance)) / MEDIAN_OF_THREE, FLOOR),
-        max(float(np.median(angle)) / MEDIAN_OF_THREE, FLOOR),
-    )
+    return np.asarray(np.maximum(np.median(_lengths(r), axis=1) / MEDIAN_OF_THREE, FLOOR))
 
 
 CLEARLY = 3.0

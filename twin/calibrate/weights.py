@@ -11,7 +11,7 @@ in the place of the weight. That says neither mass nor friction alone; beside a 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -160,8 +160,8 @@ def drag_of(robot: RobotModel, moved: np.ndarray) -> tuple[dict[str, Any], Which
     drag_N, half_N = felt_N - RUBS[0] * pressed_N, Z_95 * np.hypot(noise_N, RUBS[1] * pressed_N)
     if half_N > KNOWN_DRAG * drag_N:
         raise NoWeightError(f"no push is felt clearly: {drag_N:.3f} +- {half_N:.3f} N")
-    felt = {"felt_N": felt_N, "pressed_N": pressed_N, "noise_N": noise_N}
-    return {"drag_N": drag_N, "half_N": float(half_N), **felt}, pushing
+    said = {"drag_N": drag_N, "half_N": float(half_N), "noise_N": noise_N}
+    return {**said, "felt_N": felt_N, "pressed_N": pressed_N}, pushing
 
 
 def _equations(
@@ -261,11 +261,9 @@ def calibrate_weights(run: RunFolder) -> tuple[dict[str, Any], str]:
         raise UsageError(f"no trial of {run.path} says what it held or pushed. {why}".rstrip())
     for task, name in sorted({(row["task"], row["object"]) for row in rows}):
         mine = [row for row in rows if (row["task"], row["object"]) == (task, name)]
-        lifts = [row for row in mine if "mass_kg" in row]
-        pushes = [row for row in mine if "drag_N" in row]
-        found.setdefault(task, {})[name] = together(lifts) if lifts else {}
-        if pushes:
-            found[task][name]["drag"] = together(pushes, "drag", "N")
+        lifts, pushes = ([row for row in mine if key in row] for key in ("mass_kg", "drag_N"))
+        said = {"drag": together(pushes, "drag_N")} if pushes else {}
+        found.setdefault(task, {})[name] = {**(together(lifts) if lifts else {}), **said}
     share_masses(tasks, found)
     notes = [note for task, objects in found.items() for note in unlike(tasks[task], objects)]
     record: dict[str, Any] = {"tasks": found, "notes": notes, "not_determined": reasons}
@@ -310,10 +308,9 @@ def weighed(episode: Episode, task: Task) -> list[dict[str, Any]]:
             reasons.append(str(error))
     if not said:
         raise NoWeightError("; ".join(reasons) or "the fingers close on nothing")
-    rows = []
+    rows, source = [], {"episode": episode.info.id, "sha256": episode.sha256()}
     for name, numbers, mask in said:
         from_s, to_s = times_s[mask][[0, -1]].round(2).tolist()
-        source = {"episode": episode.info.id, "sha256": episode.sha256()}
         row = {"task": task.name, "object": name, **numbers, **source}
         rows.append({**row, "from_s": from_s, "to_s": to_s})
     return rows
@@ -350,19 +347,16 @@ def _object_at(episode: Episode, task: Task, at_ns: int) -> str:
     return task.manipulated[0]
 
 
-def together(
-    rows: Sequence[Mapping[str, Any]], what: str = "mass", unit: str = "kg"
-) -> dict[str, Any]:
+def together(rows: Sequence[Mapping[str, Any]], number: str = "mass_kg") -> dict[str, Any]:
     """What trials say of one object: ``value``, its interval, and ``why`` it is not used.
 
     What the arm's description gets wrong they share: several are no surer than the surest of them.
     """
-    values = np.array([row[f"{what}_{unit}"] for row in rows])
+    values, unit = np.array([row[number] for row in rows]), number.rpartition("_")[2]
     weights = (np.array([row[f"half_{unit}"] for row in rows]) / Z_95) ** -2.0
     value, why = float(np.average(values, weights=weights)), ""
     if float((weights * (values - value) ** 2).sum()) > chi2.ppf(AGREE_SHARE, len(rows) - 1):
-        told = zip(values.tolist(), rows, strict=True)
-        each = ", ".join(f"{number:.3f} {unit} in {row['episode']}" for number, row in told)
+        each = ", ".join(f"{row[number]:.3f} {unit} in {row['episode']}" for row in rows)
         why = f"trials do not agree ({each}): another object, or its look-alike"
     sigma = float(weights.max()) ** -0.5
     ends = {"low": value - Z_95 * sigma, "high": value + Z_95 * sigma, "why": why}
@@ -374,11 +368,10 @@ def share_masses(tasks: Mapping[str, Task], found: dict[str, dict[str, Any]]) ->
 
     The surest push counts: felt = friction x (weight + pressed).
     """
-    every = [(task, key) for task, items in found.items() for key in items]
-    held = [(_looks(tasks[task], key), found[task][key]) for task, key in every]
-    held = [(looks, item) for looks, item in held if "value" in item]
-    for task, key in every:
-        item, looks = found[task][key], _looks(tasks[task], key)
+    every = [(t, key, _looks(tasks[t], key)) for t, items in found.items() for key in items]
+    held = [(looks, found[t][key]) for t, key, looks in every if "value" in found[t][key]]
+    for task, key, looks in every:
+        item = found[task][key]
         masses = [item] if "value" in item else [mass for seen, mass in held if seen == looks]
         if "drag" not in item or item["drag"]["why"] or len(masses) != 1 or masses[0]["why"]:
             continue
@@ -386,8 +379,10 @@ def share_masses(tasks: Mapping[str, Task], found: dict[str, dict[str, Any]]) ->
         weight_N = masses[0]["value"] * PhysicsConfig.gravity_m_s2
         share = weight_N / (weight_N + row["pressed_N"])
         sigma = float(np.hypot(row["noise_N"] / row["felt_N"], share * masses[0]["sigma_log"]))
-        friction = {"value": row["felt_N"] / weight_N * share, "sigma_log": sigma}
-        found[task][key] = {**masses[0], **item, "friction": friction}
+        value = row["felt_N"] / weight_N * share
+        low, high = (value * float(np.exp(k * Z_95 * sigma)) for k in (-1, 1))
+        friction = {"value": value, "low": low, "high": high, "why": "", "sigma_log": sigma}
+        found[task][key] = {**masses[0], **item, "friction": {**friction, "sources": [row]}}
 
 
 def _looks(task: Task, key: str) -> ObjectModel:
@@ -406,39 +401,32 @@ def unlike(task: Task, found: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return notes
 
 
+TOLD = (
+    ("drag", "N of friction x weight", "which alone says neither mass nor friction"),
+    ("friction", "of friction", "replays use it"),
+    ("mass", "kg", "replays and the gate use it"),
+)
+"""Numbers of an object, their units and uses."""
+
+
 def describe_weights(record: Mapping[str, Any], calibration_id: str) -> str:
-    """Say what each object weighs, and from which seconds of which episodes."""
+    """Say what trials showed of each object, and from which seconds of which episodes."""
     lines = [f"masses: calibration {calibration_id}", *record["notes"]]
-    for task, objects in record["tasks"].items():
-        for name, item in objects.items():
-            if "drag" in item:
-                lines.append(f"  {task} {name}: {_told_of_push(item)}")
-                lines += [
-                    f"    {_when(row)}: {row['drag_N']:.4f} N" for row in item["drag"]["sources"]
-                ]
-            if "value" not in item:
-                continue
-            used = f"not used: {item['why']}" if item["why"] else "replays and the gate use it"
-            ends = f"[{item['low']:.4f}, {item['high']:.4f}]"
-            lines.append(f"  {task} {name}: {item['value']:.4f} kg {ends}, {used}")
-            for row in item["sources"]:
+    rows = [(f"  {t} {key}", x) for t, each in record["tasks"].items() for key, x in each.items()]
+    for (of, item), (number, unit, use) in product(rows, TOLD):
+        found = item if number == "mass" else item.get(number, {})
+        if "value" not in found:
+            continue
+        used = f"not used: {found['why']}" if found["why"] else use
+        ends = f"[{found['low']:.4f}, {found['high']:.4f}]"
+        lines.append(f"{of}: {found['value']:.4f} {unit} {ends}, {used}")
+        for row in found["sources"]:
+            told = f"    {row['episode']}, {row['from_s']:.2f} to {row['to_s']:.2f} s"
+            if "centre_m" in row:
                 pairs = zip(row["centre_m"], row["centre_half_m"], strict=True)
                 centre = ", ".join(f"{1e3 * x:.0f} +- {1e3 * half:.0f}" for x, half in pairs)
-                told = f"{row['mass_kg']:.4f} +- {row['half_kg']:.4f} kg"
-                lines.append(f"    {_when(row)}: {told}, centre ({centre}) mm from the tool")
+                told += f": {row['mass_kg']:.4f} +- {row['half_kg']:.4f} kg, its centre "
+                told += f"({centre}) mm from the tool"
+            lines.append(told)
     reasons = record["not_determined"].items()
     return "\n".join([*lines, *(f"  {name}: not determined: {why}" for name, why in reasons)])
-
-
-def _when(row: Mapping[str, Any]) -> str:
-    return f"{row['episode']}, {row['from_s']:.2f} to {row['to_s']:.2f} s"
-
-
-def _told_of_push(item: Mapping[str, Any]) -> str:
-    drag, rubs = item["drag"], item.get("friction")
-    told = drag["why"] or "neither mass nor friction alone: nothing like it was lifted"
-    if rubs:
-        low, high = (rubs["value"] * np.exp(k * Z_95 * rubs["sigma_log"]) for k in (-1, 1))
-        told = f"friction {rubs['value']:.3f} [{low:.3f}, {high:.3f}], replays use it"
-    ends = f"[{drag['low']:.4f}, {drag['high']:.4f}]"
-    return f"friction x weight {drag['value']:.4f} N {ends}; {told}"

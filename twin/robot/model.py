@@ -116,14 +116,6 @@ def _refusals(root: ET.Element) -> Iterator[str]:
                 yield f"the link {link.get('name')!r} with a {shape.tag} of size {told}"
 
 
-def _replace_capsules(root: ET.Element) -> None:
-    """Put the cylinder around each capsule of collision, which readers of URDF pass over."""
-    for shape in root.findall("link/collision/geometry/capsule"):
-        radius, length = (number_of(shape.get(key, "")) for key in ("radius", "length"))
-        shape.tag = "cylinder"
-        shape.set("length", repr(length + 2 * radius))
-
-
 _SAME_FRAME = 1e-6
 _TURNS_RAD = 2 * np.pi
 """Limit, to both sides, of a joint that turns without end."""
@@ -143,7 +135,10 @@ def _with_limits(urdf: str, record: Robot) -> str:
             "shapes with three extents above 0.",
         )
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
-    _replace_capsules(root)
+    for shape in root.findall("link/collision/geometry/capsule"):  # readers of URDF pass it over
+        radius, length = (number_of(shape.get(key, "")) for key in ("radius", "length"))
+        shape.tag = "cylinder"  # around it
+        shape.set("length", repr(length + 2 * radius))
     for index, name in enumerate(record.joints):
         found = joints.get(name)
         if found is None:

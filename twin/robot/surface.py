@@ -54,11 +54,6 @@ def link_poses(robot: RobotModel, posture: Posture) -> dict[str, Float[np.ndarra
     }
 
 
-def fixed_links(robot: RobotModel) -> frozenset[str]:
-    """Links that no joint moves, such as the base."""
-    return frozenset(frame.name for frame in robot.model.frames if frame.parentJoint == 0)
-
-
 @lru_cache(maxsize=4)
 def link_surfaces(robot: RobotModel) -> tuple[LinkSurface, ...]:
     """Read the surface of every link once."""
