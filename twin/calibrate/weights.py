@@ -160,8 +160,8 @@ def drag_of(robot: RobotModel, moved: np.ndarray) -> tuple[dict[str, Any], Which
     drag_N, half_N = felt_N - RUBS[0] * pressed_N, Z_95 * np.hypot(noise_N, RUBS[1] * pressed_N)
     if half_N > KNOWN_DRAG * drag_N:
         raise NoWeightError(f"no push is felt clearly: {drag_N:.3f} +- {half_N:.3f} N")
-    said = {"drag_N": drag_N, "half_N": float(half_N), "noise_N": noise_N}
-    return {**said, "felt_N": felt_N, "pressed_N": pressed_N}, pushing
+    shown = {"drag_N": drag_N, "half_N": float(half_N), "noise_N": noise_N}
+    return {**shown, "felt_N": felt_N, "pressed_N": pressed_N}, pushing
 
 
 def _equations(
@@ -262,8 +262,8 @@ def calibrate_weights(run: RunFolder) -> tuple[dict[str, Any], str]:
     for task, name in sorted({(row["task"], row["object"]) for row in rows}):
         mine = [row for row in rows if (row["task"], row["object"]) == (task, name)]
         lifts, pushes = ([row for row in mine if key in row] for key in ("mass_kg", "drag_N"))
-        said = {"drag": together(pushes, "drag_N")} if pushes else {}
-        found.setdefault(task, {})[name] = {**(together(lifts) if lifts else {}), **said}
+        shown = {"drag": together(pushes, "drag_N")} if pushes else {}
+        found.setdefault(task, {})[name] = {**(together(lifts) if lifts else {}), **shown}
     share_masses(tasks, found)
     notes = [note for task, objects in found.items() for note in unlike(tasks[task], objects)]
     record: dict[str, Any] = {"tasks": found, "notes": notes, "not_determined": reasons}
@@ -279,7 +279,7 @@ def weighed(episode: Episode, task: Task) -> list[dict[str, Any]]:
     if urdf is None:
         raise NoWeightError("no robot description was recorded")
     robot, reasons = load_robot(urdf), list[str]()
-    said = list[tuple[str, dict[str, Any], Which]]()
+    shown = list[tuple[str, dict[str, Any], Which]]()
     stamps_ns, joints, efforts = readings(episode, robot.joints)
     begun_ns = streams.first_stamp_ns(episode) or 0
     moved = smoothed((stamps_ns - begun_ns) * 1e-9, joints, efforts)
@@ -296,20 +296,20 @@ def weighed(episode: Episode, task: Task) -> list[dict[str, Any]]:
     for held_ns, held in grasps:
         try:
             name = _object_at(episode, task, held_ns)
-            said.append((name, weight_of(robot, moved, free, held), held))
+            shown.append((name, weight_of(robot, moved, free, held), held))
         except NoWeightError as error:
             reasons.append(str(error))
     for name in (pushed := [str(stage["push"]) for stage in task.stages if "push" in stage]):
         try:
             if len(pushed) > 1:
                 raise NoWeightError(f"{len(pushed)} pushes: nobody said which of them was felt")
-            said.append((name, *drag_of(robot, moved)))
+            shown.append((name, *drag_of(robot, moved)))
         except NoWeightError as error:
             reasons.append(str(error))
-    if not said:
+    if not shown:
         raise NoWeightError("; ".join(reasons) or "the fingers close on nothing")
     rows, source = [], {"episode": episode.info.id, "sha256": episode.sha256()}
-    for name, numbers, mask in said:
+    for name, numbers, mask in shown:
         from_s, to_s = times_s[mask][[0, -1]].round(2).tolist()
         row = {"task": task.name, "object": name, **numbers, **source}
         rows.append({**row, "from_s": from_s, "to_s": to_s})
