@@ -56,7 +56,8 @@ def calibrated(
     wanted, nominal = config.physics, PhysicsConfig()
     found, sigmas = (_identified(calibration.record, key) for key in ("value", "sigma_log"))
     rubs = {} if task is None else learned(calibration, task, "friction")
-    for pair, spread in rubs.values() if len(rubs) == 1 else ():  # a world has one
+    moves = [] if task is None else [item for item in task.objects.values() if not item.fixed]
+    for pair, spread in rubs.values() if len(moves) == 1 else ():  # a world has one friction
         found["surface_friction"] = pair / wanted.object_friction
         sigmas["surface_friction"] = spread
     known = {k: v for k, v in found.items() if k in vars(nominal)}
