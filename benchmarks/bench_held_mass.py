@@ -27,13 +27,14 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from bench_lab_difficulty import trial
 from cell_run import FileSession
 from measure import Target, report_targets
 
 from bridge.episode.reader import Episode
-from bridge.sources.standin.cell import StandinCell
+from bridge.sources.standin.cell import StandinCell, TruthLog
 from bridge.sources.standin.cell_file import draw_hidden, load_cell
+from bridge.sources.standin.operator import LOOK_S, execute_plan, label_trial
+from bridge.sources.standin.planner import NO_ERROR, perceive, plan_pick_and_place
 from bridge.sources.standin.streams import Streams
 from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.task.task_file import load_task
@@ -45,29 +46,56 @@ TASKS = ("cube_into_box", "heavy_block_into_box")
 BIAS_NM, DRIFT_NM, NOISE_NM = 3.0, 1.0, 0.5
 
 
-def one_trial(folder: Path, cell_name: str, seed: int, name: str, mass_kg: float) -> Any:
+def one_trial(
+    folder: Path,
+    cell_name: str,
+    seed: int,
+    name: str,
+    mass_kg: float,
+    friction: float | None = None,
+) -> Any:
     """Record a trial of an object of this mass: episode, task, and whether it was lifted."""
     file, published = load_cell(cell_name), load_task(name)
     hidden = draw_hidden(file, seed, published)
+    if friction is not None:
+        hidden = replace(hidden, object_friction=friction)
     key = published.manipulated[0]
     model = replace(published.objects[key], mass_kg=mass_kg / hidden.mass_scale)
     task = replace(published, objects={**published.objects, key: model})
     session = FileSession(folder)
-    streams = Streams(session, "standin")
-    cell = StandinCell(file, task, hidden, streams, rate_hz=0.0, seed=seed, start_ns=0)
+    cell = StandinCell(
+        file, task, hidden, Streams(session, "standin"), rate_hz=0.0, seed=seed, start_ns=0
+    )
     info = {"kind": "trial", "task": name, "stand_in": True}
     start = {"id": f"{cell_name}_{seed}", "info": info}
     session.query("start", json.dumps(start).encode(), timeout_s=1.0)
     cell.announce()
-    ended = trial(cell, seed * SEEDS_PER_SESSION, seed if cell_name == "lab" else None)
+    cell.reset(task.draw_start(np.random.default_rng(seed * SEEDS_PER_SESSION)))
+    cell.wait(LOOK_S)
+    plan = plan_pick_and_place(
+        task,
+        perceive(cell.world.Ts_base_object(), file.planner, start_seed=seed),
+        NO_ERROR,
+        kinematics=cell.kinematics,
+        joints_start_rad=cell.home_rad,
+        max_joint_speed_rad_s=file.max_joint_speed_rad_s,
+        plan_id="plan",
+        condition="without_replanning",
+        start_id="start",
+    )
+    cell.streams.plan(plan, cell.now_ns)
+    cell.truth = TruthLog()
+    execute_plan(cell, plan)
+    ended = label_trial(cell.world.task, cell.truth, executed=True)
     session.query("stop", b'{"outcome": null, "discard": false}', timeout_s=1.0)
-    lifted = ended["cause"] not in ("no plan", "stage grasp")
+    grasps = [stage for stage in ended.stages if stage["id"] == "grasp"]
+    lifted = all(stage["result"] == "success" for stage in grasps)
     return Episode.open(folder / f"{start['id']}.mcap"), published, lifted
 
 
 def with_bad_sensors(seed: int) -> Any:
     """Read joint states whose efforts have a bias, a drift and noise."""
-    rng, read = np.random.default_rng(seed), weights._readings
+    rng, read = np.random.default_rng(seed), weights.readings
     bias, drift = (rng.uniform(-most, most, 6) for most in (BIAS_NM, DRIFT_NM))
 
     def worse(*source: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -76,7 +104,7 @@ def with_bad_sensors(seed: int) -> Any:
         noise = rng.normal(0.0, NOISE_NM, efforts_Nm.shape)
         return stamps_ns, joints_rad, efforts_Nm + bias + drifting + noise
 
-    return mock.patch.object(weights, "_readings", worse)
+    return mock.patch.object(weights, "readings", worse)
 
 
 def answer(episode: Episode, task: Any) -> dict[str, Any]:

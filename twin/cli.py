@@ -124,8 +124,7 @@ def calibrate(run: Path, /, *, config: CalibrateConfig = CALIBRATE, output: Outp
     from bridge.errors import UsageError
 
     if config.cameras + config.physics + config.posterior != 1:
-        message = "say what to calibrate: RUN with --cameras, --physics or --posterior."
-        raise UsageError(message)
+        raise UsageError("say what to calibrate: RUN with --cameras, --physics or --posterior.")
     folder = RunFolder.open(run)
     with folder.alone_in(folder.scene_dir):
         refuse_full(folder.scene_dir)

@@ -4,7 +4,6 @@ Ray 2.60 without a token runs anybody's code, and its control service listens on
 even where a loopback address was asked for (measured), so a cluster without one is refused.
 """
 
-import ipaddress
 import os
 import socket
 from collections import deque
@@ -15,15 +14,8 @@ from typing import Any
 
 from bridge.episode import provenance
 from bridge.errors import MissingDependencyError, UsageError
-from bridge.process_pool import (
-    ATTEMPTS,
-    Answer,
-    Failed,
-    Function,
-    Item,
-    do,
-    lost,
-)
+from bridge.process_pool import ATTEMPTS, Answer, Failed, Function, Item, do, lost
+from bridge.wire.errors import is_loopback
 from twin.errors import TwinError
 from twin.physics.config import ENGINES
 
@@ -104,7 +96,7 @@ def _connect(address: str) -> Any:
     settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     _check_token()
     _check_somebody_listens(address)
-    if is_loopback(address):
+    if is_loopback(f"tcp/{address}"):
         # Otherwise Ray replaces the loopback address by the machine's own, where nobody answers.
         settings["_node_ip_address"] = LOOPBACK
     os.environ[MODE] = "token"
@@ -156,17 +148,6 @@ def _check_somebody_listens(address: str) -> None:
             "ray start --head, with a token; see docs/scale.md."
         )
         raise RayClusterError(message) from error
-
-
-def is_loopback(address: str) -> bool:
-    """Say whether HOST:PORT can only be this machine."""
-    host = address.rpartition(":")[0].strip("[]") or address
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def code_version() -> str:

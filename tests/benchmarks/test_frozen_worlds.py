@@ -1,18 +1,14 @@
-"""What is measured on is fixed: the generated tabletop exact, the laboratory as hard as before."""
+"""What is measured on is fixed: the generated tabletop is exact."""
 
-import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from bridge.geometry import se3
-from bridge.sources.standin.cell_file import load_cell
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-sys.path.insert(0, str(BENCHMARKS))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 
 @pytest.mark.slow
@@ -33,19 +29,3 @@ def test_the_tabletop_repeats_and_its_depth_is_exact() -> None:
         on_table = np.abs(points[..., 2] - clean_tabletop.TABLE_M) < 2e-3
         assert on_table.mean() > 0.25
         assert depth_m.max() < 5.0
-
-
-ROWS: list[dict[str, Any]] = json.loads(
-    (BENCHMARKS / "results" / "lab_difficulty.json").read_text()
-)["tasks"]
-
-
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: str(row["task"]))
-def test_thirty_to_eighty_percent_succeed_and_the_world_is_to_blame(row: dict[str, Any]) -> None:
-    good = [item for item in row["trials"] if item["result"] == "success"]
-    assert (row["k"], row["n"]) == (len(good), len(row["trials"]))
-    assert row["n"] >= 40
-    assert 0.3 <= row["k"] / row["n"] <= 0.8
-    assert row["control_k"] >= 0.9 * row["control_n"] > 0
-    low, high = load_cell("lab").development_seeds
-    assert all(low <= item["lab"] <= high for item in row["trials"])

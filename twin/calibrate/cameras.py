@@ -42,7 +42,12 @@ def placement(episodes: Sequence[Episode]) -> dict[str, bool]:
     found: dict[str, bool] = {}
     for episode in episodes:
         for camera_id in depth_cameras(episode):
-            found[camera_id] = found.get(camera_id, False) or _moves(episode, camera_id)
+            frame = streams.camera_info(episode, camera_id, "depth").frame_id
+            tree = streams.transform_tree(episode)
+            known = frame in tree.frames()
+            posed_ns = tree.stamps_ns(frame) if known else np.zeros(0, dtype=np.int64)
+            moves = len(posed_ns) > 0 and not never_moves(tree, frame, posed_ns)
+            found[camera_id] = found.get(camera_id, False) or moves
     return found
 
 
@@ -53,13 +58,6 @@ def depth_cameras(episode: Episode) -> list[str]:
     return sorted(
         stem.split("/")[-1] for stem in stems if f"{stem}{DEPTH_INFO}" in topics and CAMERAS in stem
     )
-
-
-def _moves(episode: Episode, camera_id: str) -> bool:
-    frame = streams.camera_info(episode, camera_id, "depth").frame_id
-    tree = streams.transform_tree(episode)
-    posed_ns = tree.stamps_ns(frame) if frame in tree.frames() else np.zeros(0, dtype=np.int64)
-    return len(posed_ns) > 0 and not never_moves(tree, frame, posed_ns)
 
 
 @dataclass(frozen=True)
@@ -286,9 +284,9 @@ def _camera(
 def target_record(pairs: PosePairs, config: CalibrateConfig, base: str) -> dict[str, Any]:
     """Say what pose pairs give."""
     solution, mount = find_camera(pairs, config.mount)
-    found, names = asdict(solution), ("T_link_camera", "T_effector_target")
+    found, names = asdict(solution), ("T_effector_target", "T_link_camera")
+    names = ("T_link_camera", "T_base_target") if mount == "hand" else names
     X, Z = (se3.pose_record(found.pop(name)) for name in "XZ")
-    names = ("T_link_camera", "T_base_target") if mount == "hand" else names[::-1]
     return {
         "method": "target pose pairs, AX = ZB",
         "mount": mount,

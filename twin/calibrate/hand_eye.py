@@ -39,13 +39,6 @@ def motions(
     return P, Q
 
 
-def solve_hand_eye(
-    Ts_a: Float[np.ndarray, "num_pairs 4 4"], Ts_b: Float[np.ndarray, "num_pairs 4 4"]
-) -> Float[np.ndarray, "4 4"]:
-    """Solve AX = XB for X from the motions between all poses."""
-    return solve_motions(*motions(Ts_a, Ts_b))[0]
-
-
 def solve_motions(
     P: Float[np.ndarray, "num_motions 4 4"],
     Q: Float[np.ndarray, "num_motions 4 4"],
@@ -114,7 +107,7 @@ def solve(
     UndeterminedCameraError for too few pairs, and for rotations about one axis only.
     """
     check_motions(Ts_a)
-    X = solve_hand_eye(Ts_a, Ts_b)
+    X, _ = solve_motions(*motions(Ts_a, Ts_b))
     each, J = Ts_a @ X @ se3.invert(Ts_b), np.zeros((0, 12))
     gaps = np.linalg.norm(each[:, None, :3, 3] - each[None, :, :3, 3], axis=-1)
     Z = each[int(np.argmin(np.median(gaps, axis=1)))]  # the one nearest to all others
@@ -169,7 +162,7 @@ def _refined(
     Ts_a: np.ndarray, Ts_b: np.ndarray, X: np.ndarray, Z: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "num_residuals 12"]]:
     """X, Z and the derivatives of the misfits, in units of their standard deviations."""
-    inverse = np.repeat(1.0 / np.array(_scales(misfits(Ts_a, Ts_b, X, Z))), 3)
+    inverse = np.repeat(1.0 / _scales(misfits(Ts_a, Ts_b, X, Z)), 3)
 
     def left(step: Float[np.ndarray, "12"]) -> Float[np.ndarray, " num_residuals"]:
         moved = X @ se3.small_motion(step[:6]), Z @ se3.small_motion(step[6:])
@@ -184,13 +177,9 @@ def _lengths(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.norm(r[:, :3], axis=1), np.linalg.norm(r[:, 3:], axis=1)
 
 
-def _scales(r: np.ndarray) -> tuple[float, float]:
+def _scales(r: np.ndarray) -> Float[np.ndarray, "2"]:
     """Standard deviation per axis of translation and rotation, from medians."""
-    distance, angle = _lengths(r)
-    return (
-        max(float(np.median(distance)) / MEDIAN_OF_THREE, FLOOR),
-        max(float(np.median(angle)) / MEDIAN_OF_THREE, FLOOR),
-    )
+    return np.asarray(np.maximum(np.median(_lengths(r), axis=1) / MEDIAN_OF_THREE, FLOOR))
 
 
 CLEARLY = 3.0

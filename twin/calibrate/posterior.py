@@ -150,8 +150,7 @@ def read_trials(run: RunFolder, output: Output) -> tuple[list[Trial], dict[str, 
             advance(index + 1, path.stem)
     if not trials:
         why = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-        message = f"{run.path} has no executed trial with an outcome. {why}".rstrip()
-        raise UsageError(message)
+        raise UsageError(f"{run.path} has no executed trial with an outcome. {why}".rstrip())
     return trials, reasons
 
 

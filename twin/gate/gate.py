@@ -466,7 +466,8 @@ class Gate:
             raise UndecidedError(
                 f"the cell was lost from sight while the plan was judged: {'; '.join(live.reasons)}"
             )
-        if _newest(live.frames) <= _newest(frames):
+        now_ns, then_ns = (max(int(f.stamp_ns) for f in some) for some in (live.frames, frames))
+        if now_ns <= then_ns:
             return
         moved = who_moved(found, self._find_objects(task, live.frames, ends_s), task)
         if moved:
@@ -487,10 +488,6 @@ class Gate:
 def _missing(found: Mapping[str, Any]) -> dict[str, Any]:
     """Why objects were not found, by name."""
     return {name: item.reason for name, item in found.items() if not item.found}
-
-
-def _newest(frames: Any) -> int:
-    return max(int(frame.stamp_ns) for frame in frames)
 
 
 def no_verdict(plan: Plan, reason: str) -> Verdict:

@@ -313,11 +313,8 @@ class LiveView:
         """By what the cameras are posed, in words."""
         if self._calibration is None or not self._places:
             return "cameras by /tf"
-        names = sorted(self._places)
-        return (
-            f"camera{'s' if len(names) > 1 else ''} {', '.join(names)} by robot-gst calibrate "
-            f"({self._calibration.calibration_id}), others by /tf"
-        )
+        names, known = ", ".join(sorted(self._places)), self._calibration.calibration_id
+        return f"camera {names} by robot-gst calibrate ({known}), others by /tf"
 
     def urdf(self) -> str | None:
         """The robot description, None before it arrived."""

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float
 
 from bridge.task.verdict import Verdict
 
@@ -47,6 +46,8 @@ def goes_with_success(verdict: Verdict) -> dict[str, float]:
     the strongest of all reaches once in 20 where outcomes are dealt at random (Westfall and Young
     1993). Where there is none, why, at strength 0; nothing where nothing was varied.
     """
+    from scipy.stats import rankdata  # noqa: PLC0415  # slow, and only of samples
+
     samples = verdict.samples
     if samples is None:
         why = ["what they varied was not kept: replay once more"] if verdict.p_success else []
@@ -57,7 +58,7 @@ def goes_with_success(verdict: Verdict) -> dict[str, float]:
         return {f"all {'succeed' if k else 'fail'}, so none shows what decides": 0.0}
     drawn = np.array([*samples["drawn"].values()])
     values = np.concatenate([drawn, np.abs(drawn - np.median(drawn, axis=1, keepdims=True))])
-    ranks = np.array([_ranks(row) for row in values])
+    ranks = rankdata(values, axis=1)
     weights = np.where(good, 1 / k, -1 / (n - k)) * 2 / n
     dealt = np.random.default_rng(0).permuted(np.tile(weights, (SHUFFLES, 1)), axis=1)
     limit = np.quantile(np.abs(ranks @ dealt.T).max(axis=0), LEVEL)
@@ -72,12 +73,6 @@ def goes_with_success(verdict: Verdict) -> dict[str, float]:
             found[name] = text, float(abs(strengths[place]))
     none = f"none of {len(drawn)} varied quantities goes with success more than chance does"
     return dict(found.values()) or {f"{none}; more samples may show one": 0.0}
-
-
-def _ranks(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Ranks, those of equal values their mean."""
-    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
-    return np.asarray((np.cumsum(counts) - counts / 2)[place])
 
 
 def _text(value: float, unit: str) -> str:

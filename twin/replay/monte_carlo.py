@@ -53,11 +53,12 @@ def with_draw(
 
     The objects' own friction stays: what a draw has is that of both surfaces together.
     """
-    own = config.physics.object_friction
+    own, surface = config.physics.object_friction, config.physics.surface_friction
+    measured = "surface_friction" in dict(config.variation.calibrated)
     physics = replace(
         config.physics,
         finger_friction=draw.finger_pair_friction / own,
-        surface_friction=draw.surface_pair_friction / own,
+        surface_friction=surface if measured else draw.surface_pair_friction / own,
         grip_force_N=config.physics.grip_force_N * draw.grip_scale,
     )
     known = dict(config.variation.masses)  # weighed, so nothing is left to scale

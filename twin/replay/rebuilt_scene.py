@@ -7,7 +7,7 @@ error: somebody saw what stands in the way, and a yes without it would not be an
 
 import json
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -54,8 +54,13 @@ def calibrated(
     if calibration is None:
         return config
     wanted, nominal = config.physics, PhysicsConfig()
-    names = {item.name for item in fields(PhysicsConfig)}
-    known = {k: v for k, v in _identified(calibration.record, "value").items() if k in names}
+    found, sigmas = (_identified(calibration.record, key) for key in ("value", "sigma_log"))
+    rubs = {} if task is None else learned(calibration, task, "friction")
+    moves = [] if task is None else [item for item in task.objects.values() if not item.fixed]
+    for pair, spread in rubs.values() if len(moves) == 1 else ():  # a world has one friction
+        found["surface_friction"] = pair / wanted.object_friction
+        sigmas["surface_friction"] = spread
+    known = {k: v for k, v in found.items() if k in vars(nominal)}
     free = {
         name: type(getattr(nominal, name))(value)
         for name, value in known.items()
@@ -63,14 +68,10 @@ def calibrated(
     }
     physics = replace(wanted, **free)
     taken = {name for name, value in known.items() if getattr(physics, name) == value}
-    spreads = tuple(
-        (name, spread)
-        for name, spread in sorted(_identified(calibration.record, "sigma_log").items())
-        if name in taken and spread >= 0
-    )
-    variation = replace(config.variation, calibrated=spreads)
+    spreads = [(name, x) for name, x in sorted(sigmas.items()) if name in taken and x >= 0]
+    variation = replace(config.variation, calibrated=tuple(spreads))
     if task is not None:
-        masses = tuple((key, spread) for key, (_, spread) in masses_of(calibration, task).items())
+        masses = tuple((key, spread) for key, (_, spread) in learned(calibration, task).items())
         variation = replace(variation, masses=masses, posterior=posterior_of(calibration, task))
     return replace(config, physics=physics, variation=variation)
 
@@ -85,14 +86,17 @@ def posterior_of(calibration: Calibration, task: Task) -> tuple[PosteriorDraw, .
         raise UnreadablePosteriorError(f"the posterior of calibration.json: {error}") from error
 
 
-def masses_of(calibration: Calibration | None, task: Task) -> dict[str, tuple[float, float]]:
-    """Masses [kg] of a task's objects that trials weighed, with the spread of the logarithm."""
+def learned(
+    calibration: Calibration | None, task: Task, number: str = "mass"
+) -> dict[str, tuple[float, float]]:
+    """Masses [kg] or frictions of a task's objects, and the spread of each logarithm."""
     record = {} if calibration is None else calibration.record
-    found = _mapping(_mapping(_mapping(record, MASSES), "tasks"), task.name)
+    items = _mapping(_mapping(_mapping(record, MASSES), "tasks"), task.name)
+    found = {name: x if number == "mass" else _mapping(x, number) for name, x in items.items()}
     return {
         name: (item["value"], item["sigma_log"])
         for name, item in found.items()
-        if name in task.objects and not item["why"]
+        if name in task.objects and "value" in item and not item["why"]
     }
 
 
@@ -139,7 +143,7 @@ def read_rebuilt_scene(run: RunFolder, task: Task) -> ReplayScene:
     notes = [OTHER_TASKS] if drawn and task.name not in _mapping(drawn, "tasks") else []
     weighed = {
         key: replace(task.objects[key], mass_kg=mass)
-        for key, (mass, _) in masses_of(calibration, task).items()
+        for key, (mass, _) in learned(calibration, task).items()
     }
     task = replace(task, objects={**task.objects, **weighed})
     calibration_id = None if calibration is None else calibration.calibration_id

@@ -40,7 +40,7 @@ def convex_hull(points_m: Float[np.ndarray, "num_points 3"]) -> coal.ConvexBase:
     for point in points_m:
         stored.append(np.asarray(point, dtype=np.float64))
     try:
-        return coal.ConvexBase.convexHull(stored, False, "Qt")
+        return coal.ConvexBase.convexHull(stored, True, "Qt")
     except RuntimeError:  # a corner with more than 255 neighbours
         return convex_hull(_fewer_around(points_m))
 

@@ -75,23 +75,20 @@ def _freest(robot: RobotModel, Ts_base_tcp: Poses, clearance: Clearance | None) 
 
     That is without a jump and without a touch; else the one that comes farthest is kept.
     """
-    best: tuple[tuple[int, int, int], Followed] | None = None
+    ways: list[tuple[tuple[int, ...], int, Followed]] = []
     unknown = np.full(len(Ts_base_tcp), NO_BRANCH, dtype=np.int64)
     nothing = np.zeros((len(Ts_base_tcp), len(robot.joints)))
-    for first in solutions(robot, Ts_base_tcp[0]):
+    for number, first in enumerate(solutions(robot, Ts_base_tcp[0])):
         start_rad = first.joints_rad
         way = _completed(robot, Ts_base_tcp, nothing, unknown, start_rad, exact=False)
         steps = np.abs(np.diff(way.joints_rad[way.reached], axis=0))
         asked = way.joints_rad[way.reached][:: -(-len(Ts_base_tcp) // _MAX_ASKED)]
         touching = clearance is not None and len(asked) and clearance(asked) < 0
         rank = (int((~way.reached).sum()), int((steps > _JUMP_RAD).sum()), int(np.sum(touching)))
-        if best is None or rank < best[0]:
-            best = (rank, way)
+        ways.append((rank, number, way))
         if not any(rank):
             break
-    if best is None:
-        raise AssertionError("a search always ends with something")
-    return best[1]
+    return min(ways)[2]
 
 
 def _completed(
@@ -174,8 +171,8 @@ class _Tree:
             ways = total[:, None] + self._steps[index - 1]
             came[index] = ways.argmin(axis=0)
             total = ways[came[index], everyone] + self._touch[index]
-        chosen: tuple[tuple[int, float], np.ndarray, np.ndarray] | None = None
-        for last in np.argsort(total, kind="stable"):
+        found: list[tuple[int, int, np.ndarray, np.ndarray]] = []
+        for rank, last in enumerate(np.argsort(total, kind="stable")):
             if not np.isfinite(total[last]):
                 break
             branch = np.empty(count, dtype=np.int64)
@@ -183,14 +180,10 @@ class _Tree:
             for index in range(count - 1, 0, -1):
                 branch[index - 1] = came[index, branch[index]]
             joints, breaks = self._turned(self._raw[np.arange(count), branch])
-            rank = (breaks, float(total[last]))
-            if chosen is None or rank < chosen[0]:
-                chosen = (rank, branch, joints)
+            found.append((breaks, rank, branch, joints))
             if breaks == 0:
                 break
-        if chosen is None:
-            raise AssertionError("every pose of a tree has a valid branch")
-        return chosen[1], chosen[2]
+        return min(found)[2:]
 
     def _turned(
         self, raw: Float[np.ndarray, "num_poses 6"]

@@ -4,18 +4,18 @@ For arms that are known from a URDF alone: joints may turn without end, and all 
 angle, which nothing drives.
 """
 
-import xml.etree.ElementTree as ET
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
 from twin.robot.collision import collision_geometry, convex_hull, corners_of
-from twin.robot.model import RobotDescriptionError, built, parse_description
+from twin.robot.model import RobotDescriptionError, built, with_absolute_meshes
 
 _PACKAGE = "package://"
-_WHOLE_TURN_RAD = "6.283185307179586"
 
 
 class Hand:
@@ -27,57 +27,52 @@ class Hand:
             raise RobotDescriptionError(
                 f"is not at {urdf}", "Import the data set again, with its robot folder."
             )
-        root = parse_description(urdf.read_text())
-        _with_local_meshes(root, urdf.parent)
-        text = ET.tostring(root, encoding="unicode")
-        self._model = built(text)
-        geometry = collision_geometry(self._model, text)
-        self._data = self._model.createData()
-        known = list(self._model.names)[1:]
+        text = with_absolute_meshes(urdf.read_text(), partial(_beside, urdf.parent))
+        self._model = model = built(text)
+        self._data = model.createData()
+        known = list(model.names)[1:]
         missing = [name for name in joints if name not in known]
         if missing:
             raise RobotDescriptionError(
                 f"lacks the joints {', '.join(missing)}", f"It has: {', '.join(known)}."
             )
-        if not self._model.existFrame(hand_link):
-            names = ", ".join(link.get("name", "") for link in root.findall("link"))
+        if not model.existFrame(hand_link):
+            names = ", ".join(frame.name for frame in model.frames if frame.type == pin.BODY)
             raise RobotDescriptionError(f"lacks {hand_link!r}", f"It has: {names}.")
-        arms = [self._model.joints[self._model.getJointId(name)] for name in joints]
-        self._ids, self._velocity_ids = [j.idx_q for j in arms], [j.idx_v for j in arms]
-        self._frame = self._model.getFrameId(hand_link)
-        behind = self._model.subtrees[self._model.frames[self._frame].parentJoint]
+        self._frame = model.getFrameId(hand_link)
+        behind = model.subtrees[model.frames[self._frame].parentJoint]
         self._pieces = [
             (item.parentJoint, item.placement, np.array(convex_hull(corners_of(item)).points()))
-            for item in geometry.geometryObjects
+            for item in collision_geometry(model, text).geometryObjects
             if item.parentJoint in behind
         ]
-        arm = {self._model.getJointId(name) for name in joints}
-        self._finger_ids = [
-            self._model.joints[index].idx_q
-            for index in sorted({joint for joint, _, _ in self._pieces} - arm)
-        ]
+        arm = [model.getJointId(name) for name in joints]
+        fingers = {joint for joint, _, _ in self._pieces}.difference(arm)
+        self._arm, self._fingers = ([model.joints[k].idx_v for k in ids] for ids in (arm, fingers))
+
+    def _turn(self, joints: list[int], angles_rad: Any) -> Float[np.ndarray, " num_values"]:
+        """Place all links with some joints at these angles, the others at zero."""
+        turned = np.zeros(self._model.nv)
+        turned[joints] = angles_rad
+        q = pin.integrate(self._model, pin.neutral(self._model), turned)
+        pin.framesForwardKinematics(self._model, self._data, q)
+        return np.asarray(q)
 
     def T_base_hand(self, joints_rad: Float[np.ndarray, " num_joints"]) -> Float[np.ndarray, "4 4"]:
         """Forward kinematics of the hand link."""
-        q = pin.neutral(self._model)
-        q[self._ids] = joints_rad
-        pin.framesForwardKinematics(self._model, self._data, q)
+        self._turn(self._arm, joints_rad)
         return np.array(self._data.oMf[self._frame].homogeneous)
 
     def gravity_nm(
         self, joints_rad: Float[np.ndarray, " num_joints"]
     ) -> Float[np.ndarray, " num_joints"]:
         """Torque with which each joint holds the arm."""
-        q = pin.neutral(self._model)
-        q[self._ids] = joints_rad
-        torque = pin.computeGeneralizedGravity(self._model, self._data, q)
-        return np.array(torque)[self._velocity_ids]
+        q = self._turn(self._arm, joints_rad)
+        return np.array(pin.computeGeneralizedGravity(self._model, self._data, q))[self._arm]
 
     def hulls_m(self, finger_rad: float = 0.0) -> list[Float[np.ndarray, "num_points 3"]]:
         """Convex pieces of the hand link and of all links behind it: corners in its frame [m]."""
-        q = pin.neutral(self._model)
-        q[self._finger_ids] = finger_rad
-        pin.framesForwardKinematics(self._model, self._data, q)
+        self._turn(self._fingers, finger_rad)
         T_hand_base = self._data.oMf[self._frame].inverse()
         hulls = []
         for joint, placement, corners in self._pieces:
@@ -86,23 +81,12 @@ class Hand:
         return hulls
 
 
-def _with_local_meshes(root: ET.Element, folder: Path) -> None:
-    for joint in root.findall("joint"):  # one number for each joint
-        limit = joint.find("limit")
-        if joint.get("type") == "continuous" and limit is not None:
-            joint.set("type", "revolute")
-            limit.set("lower", f"-{_WHOLE_TURN_RAD}")
-            limit.set("upper", _WHOLE_TURN_RAD)
-    for link in root.findall("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
-        for mesh in link.iter("mesh"):
-            name = mesh.get("filename", "")
-            local = name.removeprefix(_PACKAGE).partition("/")[2] if _PACKAGE in name else name
-            path = folder / local
-            if not path.is_file():
-                raise RobotDescriptionError(
-                    f"names the mesh {name!r}, which is not at {path}",
-                    "Put it there, or import the data set again with its robot folder.",
-                )
-            mesh.set("filename", str(path))
+def _beside(folder: Path, name: str) -> Path:
+    local = name.removeprefix(_PACKAGE).partition("/")[2] if _PACKAGE in name else name
+    path = folder / local
+    if not path.is_file():
+        raise RobotDescriptionError(
+            f"names the mesh {name!r}, which is not at {path}",
+            "Put it there, or import the data set again with its robot folder.",
+        )
+    return path

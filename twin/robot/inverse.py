@@ -370,18 +370,7 @@ def _through(
         T_6_tcp=np.eye(4),
     )
     T_6_tcp = np.linalg.solve(chain.forward(np.zeros(6)), T_base_tcp)
-    return UrGeometry(**{**vars(chain), "T_6_tcp": T_6_tcp})
-
-
-def _checked(geometry: UrGeometry, robot: RobotModel) -> UrGeometry | None:
-    rng = np.random.default_rng(0)
-    postures = rng.uniform(-np.pi, np.pi, (_NUM_CHECKS, 6))
-    worst = max(
-        float(np.abs(geometry.forward(row) - robot.T_base_tcp(row)).max()) for row in postures
-    )
-    if not worst < _WORST:
-        return None
-    return UrGeometry(**{**vars(geometry), "deviation": worst})
+    return replace(chain, T_6_tcp=T_6_tcp)
 
 
 def _meeting(
@@ -425,7 +414,7 @@ _LIMIT_SLACK_RAD = 1e-9
 _TURN = 2 * np.pi
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class UrInverse:
     """All joints of a UR-type arm that reach a pose."""
 
@@ -439,10 +428,13 @@ class UrInverse:
         """Return the inverse of a robot's arm, None when its geometry is not that of a UR."""
         axes = _axes(robot)
         laid = None if axes is None else _through(*axes, robot.T_base_tcp(np.zeros(6)))
-        geometry = None if laid is None else _checked(laid, robot)
-        if geometry is None:
+        if laid is None:
             return None
-        return UrInverse(geometry=geometry, lower_rad=robot.lower_rad, upper_rad=robot.upper_rad)
+        rows = np.random.default_rng(0).uniform(-np.pi, np.pi, (_NUM_CHECKS, 6))
+        worst = max(float(np.abs(laid.forward(q) - robot.T_base_tcp(q)).max()) for q in rows)
+        if not worst < _WORST:
+            return None
+        return UrInverse(replace(laid, deviation=worst), robot.lower_rad, robot.upper_rad)
 
     def solve(
         self, Ts_base_tcp: Float[np.ndarray, "num_poses 4 4"]

@@ -7,8 +7,9 @@ scratch memory: use it from one thread at a time.
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,14 +51,14 @@ def mimicked(urdf: str) -> tuple[Mimic, ...]:
     return found
 
 
-def with_absolute_meshes(urdf: str) -> str:
+def with_absolute_meshes(urdf: str, resolve: Callable[[str], Path] = resolve_mesh) -> str:
     """Replace ``package://`` URIs by paths; visuals are dropped."""
     root = parse_description(urdf)
     for link in root.findall("link"):
         for visual in link.findall("visual"):
             link.remove(visual)
         for mesh in link.iter("mesh"):
-            mesh.set("filename", str(resolve_mesh(mesh.get("filename", ""))))
+            mesh.set("filename", str(resolve(mesh.get("filename", ""))))
     return ET.tostring(root, encoding="unicode")
 
 
@@ -115,16 +116,6 @@ def _refusals(root: ET.Element) -> Iterator[str]:
                 yield f"the link {link.get('name')!r} with a {shape.tag} of size {told}"
 
 
-def _replace_capsules(root: ET.Element) -> bool:
-    """Put the cylinder around each capsule of collision, which readers of URDF pass over."""
-    capsules = [shape for link in root for shape in link.findall("collision/geometry/capsule")]
-    for shape in capsules:
-        radius, length = (number_of(shape.get(key, "")) for key in ("radius", "length"))
-        shape.tag = "cylinder"
-        shape.set("length", repr(length + 2 * radius))
-    return bool(capsules)
-
-
 _SAME_FRAME = 1e-6
 _TURNS_RAD = 2 * np.pi
 """Limit, to both sides, of a joint that turns without end."""
@@ -144,7 +135,10 @@ def _with_limits(urdf: str, record: Robot) -> str:
             "shapes with three extents above 0.",
         )
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
-    changed = _replace_capsules(root)
+    for shape in root.findall("link/collision/geometry/capsule"):  # readers of URDF pass it over
+        radius, length = (number_of(shape.get(key, "")) for key in ("radius", "length"))
+        shape.tag = "cylinder"  # around it
+        shape.set("length", repr(length + 2 * radius))
     for index, name in enumerate(record.joints):
         found = joints.get(name)
         if found is None:
@@ -163,8 +157,7 @@ def _with_limits(urdf: str, record: Robot) -> str:
                 element = ET.SubElement(found, "limit", effort="0", velocity="0")
             for key, value in limits.items():
                 element.set(key, repr(value))
-            changed = True
-    return ET.tostring(root, encoding="unicode") if changed else urdf
+    return ET.tostring(root, encoding="unicode")
 
 
 def _rooted(urdf: str, T_base_root: Float[np.ndarray, "4 4"]) -> str:

@@ -7,7 +7,6 @@ visual meshes they load without a reader of COLLADA files. Normals are those of 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import coal
@@ -17,12 +16,10 @@ from jaxtyping import Float, Float32, Int, Int64
 
 from bridge.geometry import se3
 from bridge.geometry.mesh import sample_triangles
-from twin.robot.collision import collision_geometry
+from twin.robot.collision import collision_geometry, convex_hull, corners_of
 from twin.robot.model import RobotDescriptionError, RobotModel
 from twin.robot.posture import Posture
 
-_NOT_READ = (".dae", ".DAE")
-"""Meshes that Open3D does not read, and pinocchio did."""
 NOT_SEEN = ("ee_link",)
 """Markers inside other links, not parts of the robot."""
 
@@ -55,11 +52,6 @@ def link_poses(robot: RobotModel, posture: Posture) -> dict[str, Float[np.ndarra
         frame.name: np.array(robot.data.oMf[index].homogeneous)
         for index, frame in enumerate(robot.model.frames)
     }
-
-
-def fixed_links(robot: RobotModel) -> frozenset[str]:
-    """Links that no joint moves, such as the base."""
-    return frozenset(frame.name for frame in robot.model.frames if frame.parentJoint == 0)
 
 
 @lru_cache(maxsize=4)
@@ -155,34 +147,15 @@ def sample_surface(
     return np.asarray(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
 
 
-def _mesh(item: Any) -> tuple[np.ndarray, np.ndarray]:
-    import open3d  # noqa: PLC0415  # loads 300 modules; pages that only read need none
-
+def _mesh(item: pin.GeometryObject) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and triangles of a shape as pinocchio read it; of what is round, those around it."""
     shape = item.geometry
-    if isinstance(shape, coal.BVHModelBase) and Path(str(item.meshPath)).suffix in _NOT_READ:
-        corners = [shape.tri_indices(index) for index in range(shape.num_tris)]
-        triangles = [[item[0], item[1], item[2]] for item in corners]
-        return np.array(shape.vertices()), np.array(triangles, dtype=np.int64)
     if isinstance(shape, coal.BVHModelBase):
-        mesh = open3d.io.read_triangle_mesh(Path(str(item.meshPath)))
-        vertices = np.asarray(mesh.vertices) * np.array(item.meshScale)
-    elif isinstance(shape, coal.Box):
-        half = np.array(shape.halfSide)
-        mesh = open3d.geometry.TriangleMesh.create_box(*(2 * half))
-        vertices = np.asarray(mesh.vertices) - half
-    elif isinstance(shape, coal.Cylinder):
-        radius, height = float(shape.radius), 2.0 * float(shape.halfLength)
-        mesh = open3d.geometry.TriangleMesh.create_cylinder(radius, height)
-        vertices = np.asarray(mesh.vertices)
-    elif isinstance(shape, coal.Sphere):
-        mesh = open3d.geometry.TriangleMesh.create_sphere(float(shape.radius))
-        vertices = np.asarray(mesh.vertices)
+        corners, three = shape.vertices(), map(shape.tri_indices, range(shape.num_tris))
     else:
-        raise RobotDescriptionError(
-            f"has a collision shape {type(shape).__name__} at {item.name}",
-            "Known: mesh, box, cylinder, sphere.",
-        )
-    return vertices, np.asarray(mesh.triangles).astype(np.int64)
+        shape = convex_hull(corners_of(item))
+        corners, three = shape.points(), map(shape.polygons, range(shape.num_polygons))
+    return np.array(corners), np.array([[face[0], face[1], face[2]] for face in three])
 
 
 def ray_scene(meshes: Iterable[tuple[np.ndarray, np.ndarray]]) -> Any:

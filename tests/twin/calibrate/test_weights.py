@@ -19,9 +19,10 @@ from bridge.robots.default import ROBOT
 from bridge.sources.standin import session, world
 from bridge.sources.standin.cell_file import draw_hidden
 from bridge.sources.standin.settings import SessionConfig
-from bridge.task.task_file import load_task
+from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from twin import cli
+from twin.calibrate import weights
 from twin.calibrate.config import CalibrateConfig
 from twin.calibrate.physics.pushes import UnusablePushError
 from twin.calibrate.posterior import draw_beforehand
@@ -29,11 +30,12 @@ from twin.calibrate.weights import NoWeightError, smoothed, together, unlike, we
 from twin.gate.twin_process import judge_of
 from twin.replay.config import ReplayConfig
 from twin.replay.monte_carlo import draw_variation, with_draw
-from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
+from twin.replay.rebuilt_scene import MASSES, for_task, read_rebuilt_scene
 from twin.robot.model import load_robot
-from twin.scene.store.calibration import read_calibration
+from twin.scene.store.calibration import read_calibration, write_part
 
 sys.path.append(str(Path(__file__).parents[3] / "benchmarks"))
+from bench_held_mass import one_trial
 from cell_run import FileSession
 
 ARM = load_robot(ROBOT.description())
@@ -217,3 +219,63 @@ def test_objects_that_look_alike_and_differ_in_mass_are_named() -> None:
     assert not unlike(twins, {first: found[first], second: found[first]})
     red = replace(twins.objects[second], color_srgb=(1, 2, 3))
     assert not unlike(replace(twins, objects={**twins.objects, second: red}), found)
+
+
+PUSHED_KG, RUBS, PUSH = 0.3, 0.25, "push_cube_to_mark"
+Pushed = tuple[RunFolder, Episode, Task]
+
+
+@pytest.fixture(scope="module")
+def push(tmp_path_factory: pytest.TempPathFactory) -> Pushed:
+    """A cube that weighs 300 g and not 120 g, pushed once over a table by MuJoCo's contacts."""
+    made = RunFolder.create(tmp_path_factory.mktemp("pushed") / "run")
+    episode, task, _ = one_trial(made.episodes_dir, "standin", 9_000_000, PUSH, PUSHED_KG, RUBS)
+    return made, episode, task
+
+
+def test_a_push_alone_says_friction_x_weight_and_nothing_else(
+    push: Pushed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, _, task = push
+    assert cli.calibrate(run.path, config=CalibrateConfig(physics=True)) == 0
+    told, known = capsys.readouterr().out, read_calibration(run)
+    assert known is not None
+    drag = known.record[MASSES]["tasks"][PUSH]["cube"]["drag"]
+    assert drag["low"] < PUSHED_KG * RUBS * 9.81 < drag["high"] < 2 * drag["low"]
+    assert re.search("neither mass nor friction\n    standin_9000000, 3", told)
+    assert for_task(ReplayConfig(), known, task).physics == ReplayConfig().physics
+
+
+def test_a_look_alike_that_was_lifted_gives_replays_the_friction(push: Pushed) -> None:
+    run, episode, task = push
+    found: dict[str, Any] = {PUSH: {"cube": {"drag": together(weighed(episode, task), "drag_N")}}}
+    lift = said("lift", PUSHED_KG, 0.01) | {"from_s": 1.0, "to_s": 2.0}
+    found["other"] = {"block": together([lift])}
+    block = replace(task.objects["cube"], id="block", mass_kg=1.0)
+    weights.share_masses({PUSH: task, "other": replace(task, objects={"block": block})}, found)
+    rubs = found[PUSH]["cube"]["friction"]
+    assert rubs["low"] < RUBS < rubs["high"] < 1.4 * rubs["low"]
+    record, _ = write_part(run, MASSES, {"tasks": found, "notes": [], "not_determined": {}})
+    assert "of friction [0.2" in weights.describe_weights(record, "x")
+    scene = read_rebuilt_scene(run, task)
+    config = for_task(ReplayConfig(), read_calibration(run), task)
+    assert scene.task.objects["cube"].mass_kg == PUSHED_KG
+    surface = config.physics.surface_friction
+    assert surface * config.physics.object_friction == pytest.approx(rubs["value"])
+    assert dict(config.variation.calibrated)["surface_friction"] == rubs["sigma_log"]
+    assert with_draw(draw_beforehand(1)[0], scene, config)[1].physics.surface_friction == surface
+
+
+def test_a_push_in_noise_one_of_several_and_those_that_do_not_agree_are_named(
+    push: Pushed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, episode, task = push
+    rows = [{"episode": "a", "drag_N": drag_N, "half_N": 0.1} for drag_N in (1.0, 3.0)]
+    assert "1.000 N in a, 3.000 N in a" in together(rows, "drag_N")["why"]
+    with pytest.raises(NoWeightError, match="2 pushes: nobody said which"):
+        weighed(episode, replace(task, stages=task.stages * 2))
+    read, rng = weights.readings, np.random.default_rng(0)
+    noisy = lambda *a: (*(got := read(*a))[:2], rng.normal(got[2], 3.0))  # noqa: E731
+    monkeypatch.setattr(weights, "readings", noisy)
+    with pytest.raises(NoWeightError, match="no push is felt clearly"):
+        weighed(episode, task)

@@ -21,7 +21,7 @@ from bridge.process_pool import Failed
 from bridge.terminal import Output
 from twin.calibrate.motion import Motion
 from twin.calibrate.physics.arm_motion import PART, motion_for
-from twin.calibrate.physics.push_fit import METHOD, load_push
+from twin.calibrate.physics.push_fit import load_push
 from twin.calibrate.physics.pushes import Push, PushResult, Trajectory, motion_of, replay_push
 from twin.physics.config import PhysicsConfig
 from twin.physics.engine import ENGINE_VERSION
@@ -81,8 +81,7 @@ def motion_replays(
     calibration = read_calibration(run)
     known_parts = {} if calibration is None else calibration.record
     arm, fit = known_parts.get(PART) or {}, known_parts.get("physics") or {}
-    if fit.get("method") != METHOD or not fit.get("promoted"):
-        fit = {}
+    fit = fit if fit.get("promoted") else {}
     with_boxes = calibrated(config, calibration, None).physics
     items: list[MotionReplay] = []
     skipped: dict[str, str] = {}

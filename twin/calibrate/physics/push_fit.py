@@ -30,8 +30,6 @@ from twin.scene.store.calibration import write_physics
 
 FINGER_FRICTION = "finger_pair_friction"
 SURFACE_FRICTION = "surface_pair_friction"
-METHOD = "pushes"
-"""Marks the physics part of a calibration that was made here."""
 FINGERS_RAD = np.linspace(0.0, 0.25, 6)
 SURFACE = np.geomspace(0.05, 1.6, 9)
 """Effective friction of box on table."""
@@ -128,12 +126,12 @@ def calibrate_pushes(
     with runner_of(config.workers) as runner:
         grid = _simulate(run, fitted, runner, output)
     best = least(grid, range(len(fitted)))
-    again = resampled(grid)
+    rubs = frictions(float(SURFACE[best[1]]), float(HAND[best[2]]), PhysicsConfig())
     scores = {
         "nominal": _score(pushes, held_out, PhysicsConfig(), 0.0),
-        "calibrated": _score(pushes, held_out, *_point(best)),
+        "calibrated": _score(pushes, held_out, rubs, float(FINGERS_RAD[best[0]])),
     }
-    record = _record(best, again, scores)
+    record = _record(best, resampled(grid), scores)
     record |= {
         "fitted_to": fitted,
         "held_out": {"episodes": held_out, **scores},
@@ -184,11 +182,6 @@ def _simulate(run: RunFolder, fitted: Sequence[str], runner: Runner, output: Out
     return np.array([errors[item] for item in items]).reshape(shape)
 
 
-def _point(point: tuple[int, int, int]) -> tuple[PhysicsConfig, float]:
-    config = frictions(float(SURFACE[point[1]]), float(HAND[point[2]]), PhysicsConfig())
-    return config, float(FINGERS_RAD[point[0]])
-
-
 def _score(
     pushes: Mapping[str, Push], names: Sequence[str], config: PhysicsConfig, finger_rad: float
 ) -> dict[str, Any]:
@@ -203,11 +196,8 @@ def _score(
 def _record(
     best: tuple[int, int, int], again: np.ndarray, scores: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    nominal, found = (
-        scores[name]["end_point_error_median_m"] for name in ("nominal", "calibrated")
-    )
-    promoted = bool(found < nominal)
-    own = PhysicsConfig().object_friction
+    nominal, found = (scores[key]["end_point_error_median_m"] for key in ("nominal", "calibrated"))
+    promoted, own = bool(found < nominal), PhysicsConfig().object_friction
     parameters, identified = {}, {}
     rows = (
         ("finger_rad", FINGERS_RAD, "rad", None),
@@ -235,7 +225,6 @@ def _record(
             }
     words = "nearer" if promoted else "no nearer"
     return {
-        "method": METHOD,
         "promoted": promoted,
         "why": f"held-out end points are {words} than at nominal friction",
         "engine": ENGINE_VERSION,

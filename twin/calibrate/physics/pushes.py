@@ -107,7 +107,16 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
         )
     T_world_hand = hand.T_base_hand(np.zeros(len(motion.joints)))
     T_world_hand[:3, 3] += motion.base_m
-    push = Push(
+    box, T_world_box, track = "", None, None
+    for box in motion.boxes:
+        topic = object_pose_topics(episode).get(box)
+        if topic is None:
+            raise UnusablePushError(f"{name}: no poses of {box!r} were recorded.")
+        track = pose_track(episode, topic)
+        T_world_box = rest_pose(track)
+        heading = np.arctan2(T_world_box[1, 0], T_world_box[0, 0])
+        T_world_box[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, heading]))
+    return Push(
         episode=name,
         sha256=episode.sha256(),
         task=episode.info.task,
@@ -115,19 +124,10 @@ def read_push(run: RunFolder, episode: Episode, motion: ScriptedMotion, hand: Ha
         hand=hand,
         tool=tool,
         T_hand_tool=se3.invert(T_world_hand) @ rest_pose(tool),
-        T_world_box=None,
+        T_world_box=T_world_box,
+        box=box,
+        box_track=track,
     )
-    if not motion.boxes:
-        return push
-    box = next(iter(motion.boxes))
-    topic = object_pose_topics(episode).get(box)
-    if topic is None:
-        raise UnusablePushError(f"{push.episode}: no poses of {box!r} were recorded.")
-    track = pose_track(episode, topic)
-    T = rest_pose(track)
-    heading = np.arctan2(T[1, 0], T[0, 0])
-    T[:3, :3] = se3.rotation_from_vector(np.array([0.0, 0.0, heading]))
-    return Push(**{**vars(push), "T_world_box": T, "box": box, "box_track": track})
 
 
 def rest_pose(track: PoseTrajectory) -> Float[np.ndarray, "4 4"]:

@@ -15,7 +15,7 @@ from bridge.episode import provenance
 from bridge.episode.run_folder import RunFolder, check_episode_id
 from twin.robot.model import RobotModel, load_robot
 from twin.robot.posture import Posture
-from twin.robot.surface import PosedSurface, fixed_links
+from twin.robot.surface import PosedSurface
 from twin.scene.fit.lighting import EVEN, Lighting
 from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud, read_ply, write_ply
 
@@ -63,7 +63,7 @@ def surface_links(
     gap = p_base[near] - found.p_m
     along = np.einsum("ij,ij->i", gap, normals[near])
     aside = np.linalg.norm(gap - along[:, None] * normals[near], axis=1)
-    fixed = fixed_links(robot)
+    fixed = {frame.name for frame in robot.model.frames if not frame.parentJoint}
     never = np.array([link in fixed for link in surface.links], dtype=bool)[found.link_ids]
     close &= ~never | (aside < ASIDE_M)
     owner = np.full(len(p_base), -1, dtype=np.int64)

@@ -18,7 +18,6 @@ from twin.calibrate.physics import push_fit
 from twin.calibrate.physics.arm_motion import calibrate_physics
 from twin.calibrate.physics.imported import ENGINE, replay_imported
 from twin.calibrate.physics.push_fit import (
-    METHOD,
     calibrate_pushes,
     describe_pushes,
     frictions,
@@ -271,7 +270,6 @@ def test_a_calibration_by_pushes_is_used_and_its_runs_do_not_count(pushed: RunFo
     replay(pushed)
     own = PhysicsConfig().object_friction
     record = {
-        "method": METHOD,
         "promoted": True,
         "identified": {"surface_friction": {"value": 0.3 / own}},
         "parameters": {"finger_rad": {"value": 0.1}},

@@ -19,21 +19,13 @@ from bridge.episode.reader import Episode
 from bridge.errors import MissingDependencyError, UsageError
 from bridge.process_pool import Failed
 from twin import ray_cluster
-from twin.ray_cluster import RayClusterError, RayRunner, code_version, is_loopback
+from twin.ray_cluster import RayClusterError, RayRunner, code_version
 from twin.replay.job import ReplayJob
 from twin.replay.run_job import run_job
 
 
 def contents(job: ReplayJob) -> list[tuple[str, int, bytes]]:
     return [(m.topic, m.publish_time_ns, m.data) for m in Episode.open(job.path()).messages()]
-
-
-def test_an_address_of_this_machine_is_one() -> None:
-    assert is_loopback("127.0.0.1:6379")
-    assert is_loopback("localhost:6379")
-    assert is_loopback("[::1]:6379")
-    assert not is_loopback("192.0.2.10:6379")
-    assert not is_loopback("head.example:6379")
 
 
 def test_a_cluster_without_a_token_is_refused(
