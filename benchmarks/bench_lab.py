@@ -34,13 +34,14 @@ from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from evaluator.metrics.geometric_rule import judge_by_geometry
-from twin.calibrate.posterior import Trial, draw_beforehand, read_trials, rigid_movers, weighed
+from twin.calibrate.posterior import Trial, draw_beforehand, read_trials, weighed
 from twin.gate.config import GateConfig
 from twin.gate.gate import Gate, JudgedTasks, no_verdict
 from twin.gate.live import LiveView
 from twin.gate.service import serve_localisation
 from twin.gate.twin_process import answer, asked, look
 from twin.replay.config import PosteriorDraw
+from twin.replay.monte_carlo import rigid_movers
 
 TASKS = (
     "push_cube_to_mark",

@@ -6,7 +6,9 @@ through every trial that was executed; a draw that ends as the trial did counts 
 sampling, Gordon, Salmond and Smith 1993, without their motion). Most draws differ in numbers that
 no trial shows one by one, such as force and friction of the fingers: only together they matter, and
 the draws that are left keep them together. Friction and mass belong to the objects of a task, so
-each task is weighed by its own trials alone.
+each task is weighed by its own trials alone. Nobody says whether those are the same objects in each
+trial, or others that look alike: half of the draws have it one way and half the other, and the
+trials weigh these, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,11 +29,10 @@ from bridge.errors import GstError, UsageError
 from bridge.process_pool import Failed, runner_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success
-from bridge.task.task_file import Task
 from bridge.terminal import Output
-from twin.replay.config import UNKNOWN_LOG, BoxDraw, PosteriorDraw, ReplayConfig
+from twin.replay.config import UNKNOWN_LOG, PosteriorDraw, ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
-from twin.replay.monte_carlo import with_draw
+from twin.replay.monte_carlo import boxes_of, draw_variation, rigid_movers, sample_rng
 from twin.replay.path import path_of_plan
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
@@ -53,12 +54,6 @@ NEAR_M = 0.01
 """Standard deviation of where an object ends about where the twin has it end, at the right draw."""
 ASTRAY = 0.1
 """Weight that a draw keeps however far from there: what falls ends anywhere."""
-EDGE_SHARE = 0.4
-"""Widest step along an edge, in half the smallest extent; every share up to it is as likely: toy
-blocks and worn parts have roundings of 1 to 5 mm on edges of 25 to 40 mm."""
-CENTRE_OF_MASS = 0.15
-"""Spread of where the weight of a rigid object lies off its middle, in half extents: even things
-have 0, a bottle that is half full 0.5 along its height."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,18 +83,12 @@ class Ended:
     ends_m: Mapping[str, Float[np.ndarray, "2"]]
 
 
-def rigid_movers(task: Task) -> tuple[str, ...]:
-    """Names of a task's objects whose edges and centre of mass are drawn."""
-    return tuple(
-        sorted(name for name, item in task.objects.items() if not item.fixed and not item.soft)
-    )
-
-
 def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDraw]:
     """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
 
     Args:
-        movers: Rigid objects that move, each with edges and a centre of mass of its own.
+        movers: Rigid objects that move, each with edges and a centre of mass of its own: the same
+            in all trials for every second draw, anew in each trial for the others.
     """
     unit = qmc.Sobol(d=6 + 4 * len(movers), scramble=True, seed=0).random(count)
     z = ndtri(np.clip(unit, 1e-6, 1 - 1e-6))
@@ -112,27 +101,21 @@ def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDra
             mass_scale=float(mass),
             grip_scale=float(grip),
             bias_m=(float(bias[0]), float(bias[1])),
-            boxes=_boxes(movers, row.reshape(-1, 4)),
+            boxes=boxes_of(movers, share, centre) if number % 2 == 0 else (),
             weight=1.0 / count,
             wrong_yes=WRONG[0] / sum(WRONG),
             wrong_no=WRONG[0] / sum(WRONG),
         )
-        for (finger, surface), (mass, grip), bias, row in zip(
-            frictions, factors, BIAS_M * z[:, 4:6], unit[:, 6:], strict=True
+        for number, (finger, surface), (mass, grip), bias, share, centre in zip(
+            range(count),
+            frictions,
+            factors,
+            BIAS_M * z[:, 4:6],
+            unit[:, 6::4],
+            z[:, 6:].reshape(count, -1, 4)[:, :, 1:],
+            strict=True,
         )
     ]
-
-
-def _boxes(movers: Sequence[str], unit: Float[np.ndarray, "num_movers 4"]) -> tuple[BoxDraw, ...]:
-    centres = np.clip(CENTRE_OF_MASS * ndtri(np.clip(unit[:, 1:], 1e-6, 1 - 1e-6)), -0.9, 0.9)
-    return tuple(
-        BoxDraw(
-            name=name,
-            edge_share=EDGE_SHARE * float(share),
-            centre_of_mass=(float(centre[0]), float(centre[1]), float(centre[2])),
-        )
-        for name, share, centre in zip(movers, unit[:, 0], centres, strict=True)
-    )
 
 
 def read_trials(run: RunFolder, output: Output) -> tuple[list[Trial], dict[str, str]]:
@@ -196,9 +179,11 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     )
 
 
-def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
-    """Replay a trial's plan as a draw would have it."""
-    scene, config = with_draw(draw, trial.scene, trial.config)
+def end_of(trial: Trial, draw: PosteriorDraw, number: int) -> Ended:
+    """Replay a trial's plan as a draw would have it, from a start as sure as it is known."""
+    variation = replace(trial.config.variation, posterior=(draw,))
+    rng, config = sample_rng(0, trial.info.id, number), replace(trial.config, variation=variation)
+    scene, config = draw_variation(rng, trial.scene, config)
     robot = load_robot(scene.urdf)
     scene = free_start(scene, soft_models(scene))
     path, _, _ = path_of_plan(trial.plan, robot)
@@ -235,9 +220,9 @@ Piece = tuple[int, Trial, PosteriorDraw]
 
 
 def _ended(piece: Piece) -> Ended:
-    _, trial, draw = piece
+    number, trial, draw = piece
     try:
-        return end_of(trial, draw)
+        return end_of(trial, draw, number)
     except GstError:  # as the gate counts a sample that cannot be replayed
         return Ended(success=False, ends_m={})
 

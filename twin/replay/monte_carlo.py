@@ -1,7 +1,7 @@
 """Success probability by Monte Carlo: replays of varied starts and settings.
 
-Poses, frictions, forces, masses, stiffnesses and delays are varied. The same seed and the same
-start draw the same variations, whatever plan is replayed, on whichever worker and in whatever
+Poses, frictions, forces, masses, edges, stiffnesses and delays are varied. The same seed and the
+same start draw the same variations, whatever plan is replayed, on whichever worker and in whatever
 order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
 """
 
@@ -15,12 +15,13 @@ from jaxtyping import Float
 
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
-from bridge.task.task_file import ObjectModel
+from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.unseen import Unseen
 from twin.replay.config import (
     UNKNOWN_POSE_M,
     UNKNOWN_POSE_RAD,
+    BoxDraw,
     PosteriorDraw,
     ReplayConfig,
 )
@@ -36,6 +37,12 @@ UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
 RESTS_M = 1e-4
 """Localisation puts what stands exactly onto the table; within this counts as exactly [m]."""
+EDGE_SHARE = 0.4
+"""Widest step along an edge, in half the smallest extent; every share up to it is as likely: toy
+blocks and worn parts have roundings of 1 to 5 mm on edges of 25 to 40 mm."""
+CENTRE_OF_MASS = 0.15
+"""Spread of where the weight of a rigid object lies off its middle, in half extents: even things
+have 0, a bottle that is half full 0.5 along its height."""
 UNSURE_AXES = (0, 1, 5)
 """What is unsure of an object that stands: x, y and the turn about the vertical."""
 
@@ -72,14 +79,38 @@ def with_draw(
         poses[name] = T.copy()
         poses[name][:2, 3] += draw.bias_m
     task = replace(scene.task, objects=objects)
-    unseen = {}
-    for box in draw.boxes:
+    moved = replace(scene, task=task, Ts_base_object=poses, unseen=_unseen(draw.boxes, objects))
+    return moved, replace(config, physics=physics)
+
+
+def _unseen(boxes: Sequence[BoxDraw], objects: Mapping[str, ObjectModel]) -> dict[str, Unseen]:
+    found = {}
+    for box in boxes:
         half = np.array(objects[box.name].size_m) / 2
         x, y, z = (half * box.centre_of_mass).tolist()
         edge_m = float(box.edge_share * half.min())
-        unseen[box.name] = Unseen(edge_m=edge_m, centre_of_mass_m=(x, y, z))
-    moved = replace(scene, task=task, Ts_base_object=poses, unseen=unseen)
-    return moved, replace(config, physics=physics)
+        found[box.name] = Unseen(edge_m=edge_m, centre_of_mass_m=(x, y, z))
+    return found
+
+
+def rigid_movers(task: Task) -> tuple[str, ...]:
+    """Names of a task's objects whose edges and centre of mass are drawn."""
+    return tuple(
+        sorted(name for name, item in task.objects.items() if not item.fixed and not item.soft)
+    )
+
+
+def boxes_of(
+    movers: Sequence[str],
+    share: Float[np.ndarray, " num_movers"],
+    z: Float[np.ndarray, "num_movers 3"],
+) -> tuple[BoxDraw, ...]:
+    """Edges and centres of mass of rigid objects, from even shares and from normal numbers."""
+    edges, centres = EDGE_SHARE * share, np.clip(CENTRE_OF_MASS * z, -0.9, 0.9)
+    return tuple(
+        BoxDraw(name=name, edge_share=edge, centre_of_mass=(x, y, z))
+        for name, edge, (x, y, z) in zip(movers, edges.tolist(), centres.tolist(), strict=True)
+    )
 
 
 def halving(index: int) -> float:
@@ -99,7 +130,8 @@ def draw_variation(
     """Draw poses from the localisation's covariance and physics from the priors.
 
     Where there is a posterior, what it knows of comes from its draws: the samples take turns (by
-    index), so that each has as many as its weight says. A varied replay has no samples of its own.
+    index), so that each has as many as its weight says. Edges and centres of mass that it does not
+    say are drawn. A varied replay has no samples of its own.
 
     Poses of different objects are drawn independently, although they share the cameras' errors.
     What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
@@ -129,8 +161,11 @@ def draw_variation(
             root = _root(T, model, scene, name)
             poses[name] = _moved(T, root @ z[:6], model)
     task = replace(scene.task, objects={name: objects[name] for name in scene.task.objects})
+    count, movers = len(objects), rigid_movers(task)
+    boxes = boxes_of(sorted(objects), rng.random(count), rng.standard_normal((count, 3)))
+    unseen = _unseen([box for box in boxes if box.name in movers], objects) | dict(scene.unseen)
     return (
-        replace(scene, task=task, Ts_base_object=poses),
+        replace(scene, task=task, Ts_base_object=poses, unseen=unseen),
         replace(config, physics=physics, grip_delay_s=delay_s, samples=0),
     )
 
@@ -249,6 +284,10 @@ def _drawn(
         found[f"mass of {name} times"] = model.mass_kg / nominal.mass_kg
         if model.soft is not None and nominal.soft is not None:
             found[f"stiffness of {name} times"] = model.soft.young_pa / nominal.soft.young_pa
+    for name, box in there.unseen.items():
+        found[f"edges of {name} m"] = box.edge_m
+        for axis, off_m in zip("xyz", box.centre_of_mass_m, strict=True):
+            found[f"weight of {name} off along {axis} m"] = off_m
     for name, T in there.Ts_base_object.items():
         before = scene.Ts_base_object[name]
         turned = se3.vector_from_rotation(T[:3, :3] @ before[:3, :3].T)
