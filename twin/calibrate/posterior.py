@@ -6,9 +6,7 @@ through every trial that was executed; a draw that ends as the trial did counts 
 sampling, Gordon, Salmond and Smith 1993, without their motion). Most draws differ in numbers that
 no trial shows one by one, such as force and friction of the fingers: only together they matter, and
 the draws that are left keep them together. Friction and mass belong to the objects of a task, so
-each task is weighed by its own trials alone. Nobody says whether those are the same objects in each
-trial, or others that look alike: half of the draws have it one way and half the other, and the
-trials weigh these, too.
+each task is weighed by its own trials alone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +30,7 @@ from bridge.task.predicate import all_hold, evaluate_success
 from bridge.terminal import Output
 from twin.replay.config import UNKNOWN_LOG, PosteriorDraw, ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
-from twin.replay.monte_carlo import boxes_of, draw_variation, rigid_movers, sample_rng
+from twin.replay.monte_carlo import boxes_of, rigid_movers, with_draw
 from twin.replay.path import path_of_plan
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
@@ -87,8 +85,7 @@ def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDra
     """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
 
     Args:
-        movers: Rigid objects that move, each with edges and a centre of mass of its own: the same
-            in all trials for every second draw, anew in each trial for the others.
+        movers: Rigid objects that move, each with edges and a centre of mass of its own.
     """
     unit = qmc.Sobol(d=6 + 4 * len(movers), scramble=True, seed=0).random(count)
     z = ndtri(np.clip(unit, 1e-6, 1 - 1e-6))
@@ -101,13 +98,12 @@ def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDra
             mass_scale=float(mass),
             grip_scale=float(grip),
             bias_m=(float(bias[0]), float(bias[1])),
-            boxes=boxes_of(movers, share, centre) if number % 2 == 0 else (),
+            boxes=boxes_of(movers, share, centre),
             weight=1.0 / count,
             wrong_yes=WRONG[0] / sum(WRONG),
             wrong_no=WRONG[0] / sum(WRONG),
         )
-        for number, (finger, surface), (mass, grip), bias, share, centre in zip(
-            range(count),
+        for (finger, surface), (mass, grip), bias, share, centre in zip(
             frictions,
             factors,
             BIAS_M * z[:, 4:6],
@@ -179,11 +175,9 @@ def _trial(run: RunFolder, episode: Episode) -> Trial:
     )
 
 
-def end_of(trial: Trial, draw: PosteriorDraw, number: int) -> Ended:
-    """Replay a trial's plan as a draw would have it, from a start as sure as it is known."""
-    variation = replace(trial.config.variation, posterior=(draw,))
-    rng, config = sample_rng(0, trial.info.id, number), replace(trial.config, variation=variation)
-    scene, config = draw_variation(rng, trial.scene, config)
+def end_of(trial: Trial, draw: PosteriorDraw) -> Ended:
+    """Replay a trial's plan as a draw would have it."""
+    scene, config = with_draw(draw, trial.scene, trial.config)
     robot = load_robot(scene.urdf)
     scene = free_start(scene, soft_models(scene))
     path, _, _ = path_of_plan(trial.plan, robot)
@@ -220,9 +214,9 @@ Piece = tuple[int, Trial, PosteriorDraw]
 
 
 def _ended(piece: Piece) -> Ended:
-    number, trial, draw = piece
+    _, trial, draw = piece
     try:
-        return end_of(trial, draw, number)
+        return end_of(trial, draw)
     except GstError:  # as the gate counts a sample that cannot be replayed
         return Ended(success=False, ends_m={})
 

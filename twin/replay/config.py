@@ -41,7 +41,7 @@ class PosteriorDraw:
     bias_m: tuple[float, float]
     """Added to every localised pose along x and y [m]."""
     boxes: tuple[BoxDraw, ...] = ()
-    """Of each rigid object that moves; none: each start has objects of its own."""
+    """Of each rigid object that moves; those that it has not are drawn anew in each sample."""
     weight: float
     """How much it counts; those of all draws together are 1."""
     wrong_yes: float
