@@ -27,10 +27,12 @@ from bridge.errors import GstError, UsageError
 from bridge.process_pool import Failed, runner_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success
+from bridge.task.task_file import ObjectModel
 from bridge.terminal import Output
+from twin.physics.unseen import draw_unseen
 from twin.replay.config import UNKNOWN_LOG, PosteriorDraw, ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
-from twin.replay.monte_carlo import boxes_of, rigid_movers, with_draw
+from twin.replay.monte_carlo import rigid_movers, with_draw
 from twin.replay.path import path_of_plan
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
@@ -81,7 +83,7 @@ class Ended:
     ends_m: Mapping[str, Float[np.ndarray, "2"]]
 
 
-def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDraw]:
+def draw_beforehand(count: int, movers: Mapping[str, ObjectModel]) -> list[PosteriorDraw]:
     """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
 
     Args:
@@ -98,18 +100,23 @@ def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDra
             mass_scale=float(mass),
             grip_scale=float(grip),
             bias_m=(float(bias[0]), float(bias[1])),
-            boxes=boxes_of(movers, share, centre),
+            unseen=tuple(
+                (
+                    name,
+                    draw_unseen(
+                        np.array(model.size_m),
+                        float(row[0]),
+                        ndtri(np.clip(row[1:], 1e-6, 1 - 1e-6)),
+                    ),
+                )
+                for (name, model), row in zip(movers.items(), rows, strict=True)
+            ),
             weight=1.0 / count,
             wrong_yes=WRONG[0] / sum(WRONG),
             wrong_no=WRONG[0] / sum(WRONG),
         )
-        for (finger, surface), (mass, grip), bias, share, centre in zip(
-            frictions,
-            factors,
-            BIAS_M * z[:, 4:6],
-            unit[:, 6::4],
-            z[:, 6:].reshape(count, -1, 4)[:, :, 1:],
-            strict=True,
+        for (finger, surface), (mass, grip), bias, rows in zip(
+            frictions, factors, BIAS_M * z[:, 4:6], unit[:, 6:].reshape(count, -1, 4), strict=True
         )
     ]
 

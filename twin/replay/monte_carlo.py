@@ -17,11 +17,10 @@ from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
-from twin.physics.unseen import Unseen
+from twin.physics.unseen import draw_unseen
 from twin.replay.config import (
     UNKNOWN_POSE_M,
     UNKNOWN_POSE_RAD,
-    BoxDraw,
     PosteriorDraw,
     ReplayConfig,
 )
@@ -37,12 +36,6 @@ UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
 RESTS_M = 1e-4
 """Localisation puts what stands exactly onto the table; within this counts as exactly [m]."""
-EDGE_SHARE = 0.4
-"""Widest step along an edge, in half the smallest extent; every share up to it is as likely: toy
-blocks and worn parts have roundings of 1 to 5 mm on edges of 25 to 40 mm."""
-CENTRE_OF_MASS = 0.15
-"""Spread of where the weight of a rigid object lies off its middle, in half extents: even things
-have 0, a bottle that is half full 0.5 along its height."""
 UNSURE_AXES = (0, 1, 5)
 """What is unsure of an object that stands: x, y and the turn about the vertical."""
 
@@ -79,38 +72,14 @@ def with_draw(
         poses[name] = T.copy()
         poses[name][:2, 3] += draw.bias_m
     task = replace(scene.task, objects=objects)
-    moved = replace(scene, task=task, Ts_base_object=poses, unseen=_unseen(draw.boxes, objects))
+    moved = replace(scene, task=task, Ts_base_object=poses, unseen=dict(draw.unseen))
     return moved, replace(config, physics=physics)
 
 
-def _unseen(boxes: Sequence[BoxDraw], objects: Mapping[str, ObjectModel]) -> dict[str, Unseen]:
-    found = {}
-    for box in boxes:
-        half = np.array(objects[box.name].size_m) / 2
-        x, y, z = (half * box.centre_of_mass).tolist()
-        edge_m = float(box.edge_share * half.min())
-        found[box.name] = Unseen(edge_m=edge_m, centre_of_mass_m=(x, y, z))
-    return found
-
-
-def rigid_movers(task: Task) -> tuple[str, ...]:
-    """Names of a task's objects whose edges and centre of mass are drawn."""
-    return tuple(
-        sorted(name for name, item in task.objects.items() if not item.fixed and not item.soft)
-    )
-
-
-def boxes_of(
-    movers: Sequence[str],
-    share: Float[np.ndarray, " num_movers"],
-    z: Float[np.ndarray, "num_movers 3"],
-) -> tuple[BoxDraw, ...]:
-    """Edges and centres of mass of rigid objects, from even shares and from normal numbers."""
-    edges, centres = EDGE_SHARE * share, np.clip(CENTRE_OF_MASS * z, -0.9, 0.9)
-    return tuple(
-        BoxDraw(name=name, edge_share=edge, centre_of_mass=(x, y, z))
-        for name, edge, (x, y, z) in zip(movers, edges.tolist(), centres.tolist(), strict=True)
-    )
+def rigid_movers(task: Task) -> dict[str, ObjectModel]:
+    """A task's objects whose edges and centre of mass are drawn."""
+    movers = {name: each for name, each in task.objects.items() if not (each.fixed or each.soft)}
+    return dict(sorted(movers.items()))
 
 
 def halving(index: int) -> float:
@@ -161,9 +130,10 @@ def draw_variation(
             root = _root(T, model, scene, name)
             poses[name] = _moved(T, root @ z[:6], model)
     task = replace(scene.task, objects={name: objects[name] for name in scene.task.objects})
-    count, movers = len(objects), rigid_movers(task)
-    boxes = boxes_of(sorted(objects), rng.random(count), rng.standard_normal((count, 3)))
-    unseen = _unseen([box for box in boxes if box.name in movers], objects) | dict(scene.unseen)
+    unseen = {
+        name: draw_unseen(np.array(model.size_m), float(rng.random()), rng.standard_normal(3))
+        for name, model in rigid_movers(task).items()
+    } | dict(scene.unseen)
     return (
         replace(scene, task=task, Ts_base_object=poses, unseen=unseen),
         replace(config, physics=physics, grip_delay_s=delay_s, samples=0),
