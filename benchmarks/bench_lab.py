@@ -34,13 +34,15 @@ from bridge.task.protocol import SEEDS_PER_SESSION
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from evaluator.metrics.geometric_rule import judge_by_geometry
-from twin.calibrate.posterior import Trial, draw_beforehand, read_trials, rigid_movers, weighed
+from twin.calibrate.config import CalibrateConfig
+from twin.calibrate.posterior import Trial, draw_beforehand, read_trials, weighed
 from twin.gate.config import GateConfig
 from twin.gate.gate import Gate, JudgedTasks, no_verdict
 from twin.gate.live import LiveView
 from twin.gate.service import serve_localisation
 from twin.gate.twin_process import answer, asked, look
 from twin.replay.config import PosteriorDraw
+from twin.replay.monte_carlo import rigid_movers
 
 TASKS = (
     "push_cube_to_mark",
@@ -50,11 +52,11 @@ TASKS = (
 )
 """Those of ``lab`` but the soft one, whose replays take seven times as long."""
 CELL, WIRE = "lab_mixed", "lab"
-FIRST, PER_TASK, DEVELOPMENT = 8200, 50, 1_000_200
+FIRST, PER_TASK, DEVELOPMENT = 8207, 50, 1_000_200
 LEARNED, JUDGED = 4, 12
 PLANNED, PAIRS = 28, 400
 """Sessions, and pairs of a good and a bad plan: with fewer a result is interim."""
-SAMPLES, DRAWS = 16, 32
+SAMPLES, DRAWS = GateConfig().samples, CalibrateConfig().draws
 RATE_HZ = 1.0
 RESAMPLES = 2_000
 QUIET = Output(quiet=True)
@@ -125,11 +127,11 @@ def own_engine(cell: StandinCell, trial: Trial) -> bool:
 
 
 def p_success(run: RunFolder, trial: Trial, draws: Sequence[PosteriorDraw]) -> dict[str, Any]:
-    """The verdict of a gate that knows these draws."""
+    """The verdict of a gate that knows these draws, with all of its samples."""
     question = asked(GateConfig(samples=SAMPLES), run.path, trial.plan, trial.scene)
     variation = replace(question.config.variation, posterior=tuple(draws))
     config = replace(question.config, variation=variation)
-    verdict = answer(replace(question, config=config))
+    verdict = answer(replace(question, config=config, until=None))
     causes = Counter(filter(None, (verdict.samples or {}).get("cause", ())))
     p = None if verdict.p_success is None else verdict.p_success["value"]
     return {"p": p, "accepted": verdict.accepted, "reason": verdict.reason, "causes": dict(causes)}
@@ -269,8 +271,8 @@ def main() -> None:
     num_pairs = sum(ranked(seen["success"][k], seen["rule"][k])[1] for k in of)
     interim = ": interim" * (len(found) < PLANNED or num_pairs < PAIRS)
     note = f"{CELL}, {len(found)} sessions, {len(seen['of'])} plans, {num_pairs} pairs{interim}"
-    if given.development:
-        print(f"{note}, development seeds")
+    if given.development or interim:
+        print(f"{note}{', development seeds' * given.development}")
         print_targets(targets(table))
     else:
         report_targets(CELL, targets(table), note=note, table=table, sessions=found)

@@ -27,11 +27,12 @@ from bridge.errors import GstError, UsageError
 from bridge.process_pool import Failed, runner_of
 from bridge.task.plan import Plan
 from bridge.task.predicate import all_hold, evaluate_success
-from bridge.task.task_file import Task
+from bridge.task.task_file import ObjectModel
 from bridge.terminal import Output
-from twin.replay.config import UNKNOWN_LOG, BoxDraw, PosteriorDraw, ReplayConfig
+from twin.physics.unseen import draw_unseen
+from twin.replay.config import UNKNOWN_LOG, PosteriorDraw, ReplayConfig
 from twin.replay.dynamics import free_start, simulate, soft_models
-from twin.replay.monte_carlo import with_draw
+from twin.replay.monte_carlo import rigid_movers, with_draw
 from twin.replay.path import path_of_plan
 from twin.replay.rebuilt_scene import for_task, read_rebuilt_scene
 from twin.replay.scene import ReplayScene, localised_starts
@@ -53,12 +54,6 @@ NEAR_M = 0.01
 """Standard deviation of where an object ends about where the twin has it end, at the right draw."""
 ASTRAY = 0.1
 """Weight that a draw keeps however far from there: what falls ends anywhere."""
-EDGE_SHARE = 0.4
-"""Widest step along an edge, in half the smallest extent; every share up to it is as likely: toy
-blocks and worn parts have roundings of 1 to 5 mm on edges of 25 to 40 mm."""
-CENTRE_OF_MASS = 0.15
-"""Spread of where the weight of a rigid object lies off its middle, in half extents: even things
-have 0, a bottle that is half full 0.5 along its height."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,14 +83,7 @@ class Ended:
     ends_m: Mapping[str, Float[np.ndarray, "2"]]
 
 
-def rigid_movers(task: Task) -> tuple[str, ...]:
-    """Names of a task's objects whose edges and centre of mass are drawn."""
-    return tuple(
-        sorted(name for name, item in task.objects.items() if not item.fixed and not item.soft)
-    )
-
-
-def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDraw]:
+def draw_beforehand(count: int, movers: Mapping[str, ObjectModel]) -> list[PosteriorDraw]:
     """Spread draws evenly over the priors (Sobol's sequence): the same ones every time.
 
     Args:
@@ -112,27 +100,25 @@ def draw_beforehand(count: int, movers: Sequence[str] = ()) -> list[PosteriorDra
             mass_scale=float(mass),
             grip_scale=float(grip),
             bias_m=(float(bias[0]), float(bias[1])),
-            boxes=_boxes(movers, row.reshape(-1, 4)),
+            unseen=tuple(
+                (
+                    name,
+                    draw_unseen(
+                        np.array(model.size_m),
+                        float(row[0]),
+                        ndtri(np.clip(row[1:], 1e-6, 1 - 1e-6)),
+                    ),
+                )
+                for (name, model), row in zip(movers.items(), rows, strict=True)
+            ),
             weight=1.0 / count,
             wrong_yes=WRONG[0] / sum(WRONG),
             wrong_no=WRONG[0] / sum(WRONG),
         )
-        for (finger, surface), (mass, grip), bias, row in zip(
-            frictions, factors, BIAS_M * z[:, 4:6], unit[:, 6:], strict=True
+        for (finger, surface), (mass, grip), bias, rows in zip(
+            frictions, factors, BIAS_M * z[:, 4:6], unit[:, 6:].reshape(count, -1, 4), strict=True
         )
     ]
-
-
-def _boxes(movers: Sequence[str], unit: Float[np.ndarray, "num_movers 4"]) -> tuple[BoxDraw, ...]:
-    centres = np.clip(CENTRE_OF_MASS * ndtri(np.clip(unit[:, 1:], 1e-6, 1 - 1e-6)), -0.9, 0.9)
-    return tuple(
-        BoxDraw(
-            name=name,
-            edge_share=EDGE_SHARE * float(share),
-            centre_of_mass=(float(centre[0]), float(centre[1]), float(centre[2])),
-        )
-        for name, share, centre in zip(movers, unit[:, 0], centres, strict=True)
-    )
 
 
 def read_trials(run: RunFolder, output: Output) -> tuple[list[Trial], dict[str, str]]:

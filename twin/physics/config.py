@@ -27,6 +27,16 @@ FINGER_SPEED_M_S = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
+class Unseen:
+    """What cameras do not show of a box; nothing: full edges, the weight in the middle."""
+
+    edge_m: float = 0.0
+    """Width and depth of a step along every edge: each face is smaller than the box by twice it."""
+    centre_of_mass_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """From the box's middle, along its axes."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PhysicsConfig:
     """Nominal physics; what is not measured in a cell stays at these values."""
 

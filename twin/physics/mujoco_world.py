@@ -23,8 +23,8 @@ from bridge.errors import UsageError
 from bridge.geometry import se3
 from bridge.robots.robot import Robot, mimics_of, robot_of
 from twin.physics.arm import Hulls, Joints, PhysicsError, require_parts, write_description
-from twin.physics.config import FINGER_SPEED_M_S, RIGID_ONLY, PhysicsConfig
-from twin.physics.unseen import EVEN, Unseen, box_inertia
+from twin.physics.config import FINGER_SPEED_M_S, RIGID_ONLY, PhysicsConfig, Unseen
+from twin.physics.unseen import EVEN, box_inertia, solids
 from twin.physics.world import TABLE_M, Box
 
 STEP_HZ = 480
@@ -286,9 +286,9 @@ class MujocoWorld(AbstractContextManager["MujocoWorld"]):
         if unseen != EVEN:
             body.explicitinertial, body.mass = True, mass_kg
             body.ipos, body.inertia = unseen.centre_of_mass_m, box_inertia(size_m, mass_kg)
-        solids = unseen.solids(size_m)
-        shapes = [f"{name}/{k}" if k else name for k in range(len(solids))]
-        for shape, extents in zip(shapes, solids, strict=True):
+        boxes = solids(unseen, size_m)
+        shapes = [f"{name}/{k}" if k else name for k in range(len(boxes))]
+        for shape, extents in zip(shapes, boxes, strict=True):
             body.add_geom(name=shape, mass=mass_kg, **_box(extents))
         self.free_objects.append(object_id)
         for shape in shapes:

@@ -13,11 +13,11 @@ from jaxtyping import Float
 
 from bridge.geometry import se3
 from twin.physics.arm import Arm, Hulls, LinkPose
-from twin.physics.config import PhysicsConfig
+from twin.physics.config import PhysicsConfig, Unseen
 from twin.physics.engine import Client
 from twin.physics.soft import Skin, SoftHealth, SoftModel, bind_points, health_of, rigid_fit
 from twin.physics.soft_solver import ConvexPiece, SoftSolver, add_body, box_piece, link_pieces
-from twin.physics.unseen import EVEN, Unseen, box_inertia
+from twin.physics.unseen import EVEN, box_inertia
 
 Three = tuple[float, float, float]
 SUBSTEPS = 10

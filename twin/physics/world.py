@@ -18,9 +18,9 @@ from jaxtyping import Float
 from bridge.geometry import se3
 from bridge.leaves import load_leaf
 from twin.physics.arm import Arm, Hulls, Joints, PhysicsError, Press
-from twin.physics.config import PhysicsConfig
+from twin.physics.config import PhysicsConfig, Unseen
 from twin.physics.engine import Client, give_client_back, open_client, pybullet
-from twin.physics.unseen import EVEN, Unseen, box_inertia
+from twin.physics.unseen import EVEN, box_inertia, solids
 
 # Friction that holds where it held: PyBullet's friction anchors, with fresh contact normals.
 # Without anchors friction acts against velocities only, and what the solver leaves of them adds
@@ -201,13 +201,13 @@ class World(Bodies):
         unseen: Unseen,
     ) -> int:
         """A box whose frame is its centre of mass, as the engine wants it."""
-        solids, centre = unseen.solids(size_m), np.array(unseen.centre_of_mass_m)
+        boxes, centre = solids(unseen, size_m), np.array(unseen.centre_of_mass_m)
         T_base_mass = T_base_object.copy()
         T_base_mass[:3, 3] = se3.apply(T_base_object, centre)
         shape = self.client.createCollisionShapeArray(
-            shapeTypes=[pybullet.GEOM_BOX] * len(solids),
-            halfExtents=[(extents / 2).tolist() for extents in solids],
-            collisionFramePositions=[(-centre).tolist()] * len(solids),
+            shapeTypes=[pybullet.GEOM_BOX] * len(boxes),
+            halfExtents=[(extents / 2).tolist() for extents in boxes],
+            collisionFramePositions=[(-centre).tolist()] * len(boxes),
         )
         body = self._body(shape, mass_kg, T_base_mass)
         inertia = list(box_inertia(size_m, mass_kg))

@@ -8,22 +8,11 @@ from cyclopts import Parameter
 
 from bridge.errors import UsageError, refuse_outside
 from bridge.terminal import RARE
-from twin.physics.config import RIGID_ONLY, Engine, PhysicsConfig, require_engine
+from twin.physics.config import RIGID_ONLY, Engine, PhysicsConfig, Unseen, require_engine
 
 FRICTIONS = ("object_friction", "finger_friction", "surface_friction")
 """Fields of ``PhysicsConfig`` that are frictions."""
 GRIP_FORCE = "grip_force_N"
-
-
-@dataclass(frozen=True, kw_only=True)
-class BoxDraw:
-    """What one draw says of a rigid object that moves, in parts of its size."""
-
-    name: str
-    edge_share: float
-    """Width of a step along its edges, in half its smallest extent."""
-    centre_of_mass: tuple[float, float, float]
-    """From its middle, in half extents."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +29,8 @@ class PosteriorDraw:
     """Times the force that the gripper is said to have."""
     bias_m: tuple[float, float]
     """Added to every localised pose along x and y [m]."""
-    boxes: tuple[BoxDraw, ...] = ()
-    """Of each rigid object that moves; none in files from before, where they were taken as even."""
+    unseen: tuple[tuple[str, Unseen], ...] = ()
+    """Of rigid objects that move; what is not here is drawn anew in each sample."""
     weight: float
     """How much it counts; those of all draws together are 1."""
     wrong_yes: float

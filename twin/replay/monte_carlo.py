@@ -1,7 +1,7 @@
 """Success probability by Monte Carlo: replays of varied starts and settings.
 
-Poses, frictions, forces, masses, stiffnesses and delays are varied. The same seed and the same
-start draw the same variations, whatever plan is replayed, on whichever worker and in whatever
+Poses, frictions, forces, masses, edges, stiffnesses and delays are varied. The same seed and the
+same start draw the same variations, whatever plan is replayed, on whichever worker and in whatever
 order (common random numbers: Law, Simulation Modeling and Analysis, ch. 11).
 """
 
@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from bridge.errors import GstError, UsageError
 from bridge.geometry import se3
-from bridge.task.task_file import ObjectModel
+from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
-from twin.physics.unseen import Unseen
+from twin.physics.unseen import draw_unseen
 from twin.replay.config import (
     UNKNOWN_POSE_M,
     UNKNOWN_POSE_RAD,
@@ -73,14 +73,14 @@ def with_draw(
         poses[name] = T.copy()
         poses[name][:2, 3] += draw.bias_m
     task = replace(scene.task, objects=objects)
-    unseen = {}
-    for box in draw.boxes:
-        half = np.array(objects[box.name].size_m) / 2
-        x, y, z = (half * box.centre_of_mass).tolist()
-        edge_m = float(box.edge_share * half.min())
-        unseen[box.name] = Unseen(edge_m=edge_m, centre_of_mass_m=(x, y, z))
-    moved = replace(scene, task=task, Ts_base_object=poses, unseen=unseen)
+    moved = replace(scene, task=task, Ts_base_object=poses, unseen=dict(draw.unseen))
     return moved, replace(config, physics=physics)
+
+
+def rigid_movers(task: Task) -> dict[str, ObjectModel]:
+    """A task's objects whose edges and centre of mass are drawn."""
+    movers = {name: each for name, each in task.objects.items() if not (each.fixed or each.soft)}
+    return dict(sorted(movers.items()))
 
 
 def halving(index: int) -> float:
@@ -100,7 +100,8 @@ def draw_variation(
     """Draw poses from the localisation's covariance and physics from the priors.
 
     Where there is a posterior, what it knows of comes from its draws: the samples take turns (by
-    index), so that each has as many as its weight says. A varied replay has no samples of its own.
+    index), so that each has as many as its weight says. Edges and centres of mass that it does not
+    say are drawn. A varied replay has no samples of its own.
 
     Poses of different objects are drawn independently, although they share the cameras' errors.
     What stands on the table goes on standing: its height and tilt are known, so the rest is drawn
@@ -130,8 +131,12 @@ def draw_variation(
             root = _root(T, model, scene, name)
             poses[name] = _moved(T, root @ z[:6], model)
     task = replace(scene.task, objects={name: objects[name] for name in scene.task.objects})
+    unseen = {
+        name: draw_unseen(np.array(model.size_m), float(rng.random()), rng.standard_normal(3))
+        for name, model in rigid_movers(task).items()
+    } | dict(scene.unseen)
     return (
-        replace(scene, task=task, Ts_base_object=poses),
+        replace(scene, task=task, Ts_base_object=poses, unseen=unseen),
         replace(config, physics=physics, grip_delay_s=delay_s, samples=0),
     )
 
@@ -250,6 +255,10 @@ def _drawn(
         found[f"mass of {name} times"] = model.mass_kg / nominal.mass_kg
         if model.soft is not None and nominal.soft is not None:
             found[f"stiffness of {name} times"] = model.soft.young_pa / nominal.soft.young_pa
+    for name, box in there.unseen.items():
+        found[f"edges of {name} m"] = box.edge_m
+        for axis, off_m in zip("xyz", box.centre_of_mass_m, strict=True):
+            found[f"weight of {name} off along {axis} m"] = off_m
     for name, T in there.Ts_base_object.items():
         before = scene.Ts_base_object[name]
         turned = se3.vector_from_rotation(T[:3, :3] @ before[:3, :3].T)

@@ -12,7 +12,7 @@ from bridge.episode.run_folder import RunFolder
 from bridge.errors import GstError
 from bridge.geometry import se3
 from bridge.task.task_file import Task
-from twin.physics.unseen import Unseen
+from twin.physics.config import Unseen
 from twin.replay.failure import with_reasons
 from twin.scene.localise.episode import Phase, quiet_phases, write_localised
 from twin.scene.shape.static import StaticSdf

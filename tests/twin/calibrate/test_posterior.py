@@ -19,8 +19,6 @@ from bridge.terminal import Output
 from twin.calibrate import posterior
 from twin.calibrate.posterior import (
     BIAS_M,
-    CENTRE_OF_MASS,
-    EDGE_SHARE,
     FRICTION,
     WRONG,
     Ended,
@@ -30,12 +28,13 @@ from twin.calibrate.posterior import (
     draw_beforehand,
     effective,
     log_nearness,
-    rigid_movers,
     trusted,
     weighed,
 )
+from twin.physics.unseen import CENTRE_OF_MASS, EDGE_SHARE
 from twin.replay import monte_carlo, rebuilt_scene
 from twin.replay.config import PosteriorDraw, ReplayConfig, VariationConfig
+from twin.replay.monte_carlo import rigid_movers
 from twin.replay.scene import ReplayScene
 from twin.scene.store.calibration import Calibration, read_calibration, write_part
 
@@ -74,8 +73,8 @@ def holds_from(limit: float) -> object:
 
 
 def test_draws_fill_the_priors_evenly_and_are_the_same_every_time() -> None:
-    draws = draw_beforehand(256)
-    assert draws == draw_beforehand(256)
+    draws = draw_beforehand(256, {})
+    assert draws == draw_beforehand(256, {})
     assert sum(draw.weight for draw in draws) == pytest.approx(1.0)
     friction = np.array([draw.finger_pair_friction for draw in draws])
     middle = np.sqrt(FRICTION[0] * FRICTION[1])
@@ -107,7 +106,7 @@ def test_how_far_an_answer_is_trusted_is_the_integral_over_all_rates(
 
 def test_draws_that_end_as_the_trials_did_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(posterior, "end_of", holds_from(0.3))
-    draws = draw_beforehand(64)
+    draws = draw_beforehand(64, {})
     start = scene().Ts_base_object["block"][:2, 3]
     fell = [trial(success=False, end_m=tuple(start)) for _ in range(3)]
     kept = weighed(draws, fell, workers=1, output=QUIET)
@@ -120,7 +119,7 @@ def test_draws_that_end_as_the_trials_did_are_kept(monkeypatch: pytest.MonkeyPat
 
 def test_what_no_draw_explains_makes_every_yes_doubtful(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(posterior, "end_of", holds_from(-1.0))  # the twin always says yes
-    draws = draw_beforehand(8)
+    draws = draw_beforehand(8, {})
     doubtful = weighed(draws, [trial(success=False)] * 4, workers=1, output=QUIET)
     sure = weighed(draws, [trial(success=True)] * 4, workers=1, output=QUIET)
     assert all(draw.wrong_yes > 0.7 for draw in doubtful)
@@ -140,7 +139,7 @@ def test_an_end_elsewhere_counts_against_a_draw_but_not_without_bound() -> None:
 
 
 def test_a_draw_shifts_every_object_and_keeps_the_objects_own_friction() -> None:
-    draw = replace(draw_beforehand(2)[1], bias_m=(0.004, -0.002), mass_scale=1.5)
+    draw = replace(draw_beforehand(2, {})[1], bias_m=(0.004, -0.002), mass_scale=1.5)
     before, config = scene(), ReplayConfig()
     after, settings = monte_carlo.with_draw(draw, before, config)
     for name, T in before.Ts_base_object.items():
@@ -155,27 +154,52 @@ def test_a_draw_shifts_every_object_and_keeps_the_objects_own_friction() -> None
 
 def test_each_rigid_mover_has_edges_and_weight_of_its_own_within_the_priors() -> None:
     movers = rigid_movers(load_task("clear_then_place"))
-    assert movers == ("block", "cube")
+    assert list(movers) == ["block", "cube"]
     draws = draw_beforehand(256, movers)
-    for place, name in enumerate(movers):
-        boxes = [draw.boxes[place] for draw in draws]
-        assert {box.name for box in boxes} == {name}
-        shares = np.array([box.edge_share for box in boxes])
+    for name, model in movers.items():
+        half_m = np.array(model.size_m) / 2
+        found = [dict(draw.unseen)[name] for draw in draws]
+        shares = np.array([each.edge_m for each in found]) / half_m.min()
         assert 0 <= shares.min() < 0.01 < shares.max() <= EDGE_SHARE
         assert shares.mean() == pytest.approx(EDGE_SHARE / 2, rel=0.02)
-        centres = np.array([box.centre_of_mass for box in boxes])
+        centres = np.array([each.centre_of_mass_m for each in found]) / half_m
         np.testing.assert_allclose(centres.std(axis=0), CENTRE_OF_MASS, rtol=0.05)
         np.testing.assert_allclose(centres.mean(axis=0), 0.0, atol=0.01)
-    first, second = (np.array([d.boxes[k].edge_share for d in draws]) for k in (0, 1))
+    first, second = (np.array([d.unseen[k][1].edge_m for d in draws]) for k in (0, 1))
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.1
-    assert rigid_movers(load_task("sloth_into_basket")) == ()
+    assert rigid_movers(load_task("sloth_into_basket")) == {}
+
+
+def test_samples_draw_edges_and_weight_anew_where_no_draw_says_them() -> None:
+    stays = draw_beforehand(2, rigid_movers(TASK))[0]
+    half_m = np.array(TASK.objects["block"].size_m) / 2
+
+    def seen(*draws: PosteriorDraw) -> tuple[np.ndarray, np.ndarray]:
+        config, rng = (
+            ReplayConfig(variation=VariationConfig(posterior=draws)),
+            np.random.default_rng(0),
+        )
+        drawn = [monte_carlo.draw_variation(rng, scene(), config)[0].unseen for _ in range(200)]
+        assert all(set(unseen) == {"block"} for unseen in drawn)
+        centres_m = [unseen["block"].centre_of_mass_m for unseen in drawn]
+        return np.array([unseen["block"].edge_m for unseen in drawn]), np.array(centres_m)
+
+    for draws in ((), (replace(stays, unseen=()),)):
+        edges_m, centres_m = seen(*draws)
+        assert edges_m.mean() == pytest.approx(EDGE_SHARE * half_m.min() / 2, rel=0.15)
+        np.testing.assert_allclose(centres_m.std(axis=0), CENTRE_OF_MASS * half_m, rtol=0.2)
+    edges_m, centres_m = seen(stays)
+    known = dict(stays.unseen)["block"]
+    np.testing.assert_allclose(edges_m, known.edge_m)
+    np.testing.assert_allclose(centres_m, np.tile(known.centre_of_mass_m, (200, 1)))
 
 
 def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
     shares = [monte_carlo.halving(index) for index in range(16)]
     np.testing.assert_allclose(np.diff(sorted(shares)), 1 / 17, atol=0.04)
     few = [
-        replace(draw, weight=w) for draw, w in zip(draw_beforehand(2), (0.75, 0.25), strict=True)
+        replace(draw, weight=w)
+        for draw, w in zip(draw_beforehand(2, {}), (0.75, 0.25), strict=True)
     ]
     config = ReplayConfig(variation=VariationConfig(posterior=tuple(few)))
     frictions = [
@@ -189,7 +213,7 @@ def test_samples_take_turns_among_the_draws_as_their_weights_say() -> None:
 
 
 def test_the_success_probability_counts_each_answer_as_far_as_it_is_trusted() -> None:
-    draw = replace(draw_beforehand(2)[0], weight=1.0, wrong_yes=0.4, wrong_no=0.1)
+    draw = replace(draw_beforehand(2, {})[0], weight=1.0, wrong_yes=0.4, wrong_no=0.1)
     config = ReplayConfig(samples=4, variation=VariationConfig(posterior=(draw,)))
     answers = iter([True, True, False, None])
 
@@ -219,7 +243,7 @@ def record_of(tasks: Mapping[str, Sequence[PosteriorDraw]]) -> dict[str, object]
 
 
 def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
-    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
+    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4, {})
     record = record_of({TASK.name: draws})
     _, before = write_part(run, "posterior", record)
     known = read_calibration(run)
@@ -238,7 +262,7 @@ def test_replays_read_the_posterior_that_was_written(tmp_path: Path) -> None:
 
 
 def test_a_task_takes_its_own_draws_and_never_silently_anothers(tmp_path: Path) -> None:
-    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4)
+    run, draws = RunFolder.create(tmp_path / "run"), draw_beforehand(4, {})
     other = load_task("heavy_block_into_box")
     write_part(run, "posterior", record_of({TASK.name: draws[:1], other.name: draws[1:]}))
     known = read_calibration(run)

@@ -176,7 +176,7 @@ def test_what_a_trial_weighed_turns_the_next_verdict(
     drawn, _ = draw_variation(np.random.default_rng(0), scene(), config)
     mass_kg = drawn.task.objects["cube"].mass_kg
     assert 0 < abs(mass_kg - scene().task.objects["cube"].mass_kg) < 0.1
-    wide = replace(draw_beforehand(1)[0], mass_scale=2.0)
+    wide = replace(draw_beforehand(1, {})[0], mass_scale=2.0)
     for settings, times in ((config, 1.0), (ReplayConfig(), 2.0)):
         varied, _ = with_draw(wide, scene(), settings)
         ratio = varied.task.objects["cube"].mass_kg / scene().task.objects["cube"].mass_kg

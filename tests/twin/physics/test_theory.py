@@ -8,10 +8,10 @@ from cells import ENGINES, HOME, at, cell, poses, push, rotations
 
 from bridge.geometry import se3
 from twin.physics import world as world_module
-from twin.physics.config import PhysicsConfig
+from twin.physics.config import PhysicsConfig, Unseen
 from twin.physics.soft import SoftModel
 from twin.physics.soft_solver import SoftSolver, surface_samples
-from twin.physics.unseen import EVEN, Unseen, box_inertia
+from twin.physics.unseen import EVEN, box_inertia, solids
 from twin.physics.world import World
 
 RATE_HZ = 240
@@ -192,13 +192,13 @@ TURN = se3.rotation_from_vector(np.array([0.3, -0.5, 0.8]))
 
 def test_a_stepped_box_is_as_wide_as_before_and_its_faces_are_smaller() -> None:
     size = np.array([0.03, 0.04, 0.06])
-    solids = Unseen(edge_m=0.005).solids(size)
-    np.testing.assert_allclose(np.max(solids, axis=0), size)
-    for axis, extents in enumerate(solids):
+    boxes = solids(Unseen(edge_m=0.005), size)
+    np.testing.assert_allclose(np.max(boxes, axis=0), size)
+    for axis, extents in enumerate(boxes):
         face = np.delete(extents, axis)
         np.testing.assert_allclose(face, np.delete(size, axis) - 0.01)
-    assert len(EVEN.solids(size)) == 1
-    assert (np.array(Unseen(edge_m=1.0).solids(size)) > 0).all()
+    assert len(solids(EVEN, size)) == 1
+    assert (np.array(solids(Unseen(edge_m=1.0), size)) > 0).all()
 
 
 @each_engine
