@@ -263,7 +263,8 @@ def test_a_look_alike_that_was_lifted_gives_replays_the_friction(push: Pushed) -
     surface = config.physics.surface_friction
     assert surface * config.physics.object_friction == pytest.approx(rubs["value"])
     assert dict(config.variation.calibrated)["surface_friction"] == rubs["sigma_log"]
-    assert with_draw(draw_beforehand(1)[0], scene, config)[1].physics.surface_friction == surface
+    (drawn,) = draw_beforehand(1, {})
+    assert with_draw(drawn, scene, config)[1].physics.surface_friction == surface
 
 
 def test_a_push_in_noise_one_of_several_and_those_that_do_not_agree_are_named(
