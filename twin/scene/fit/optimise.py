@@ -1,7 +1,7 @@
 """Fit Gaussians to images: half size first, then full size, for a time or a number of images.
 
-Adam moves everything. Between its steps exposures and colours are solved in closed form
-(``appearance``) and Gaussians are split where the error is large (``densify``). Each of these looks
+Adam moves everything. Between its steps exposures are solved in closed form
+(``exposure``) and Gaussians are split where the error is large (``densify``). Each of these looks
 at many images at once, so none may take more than its share of the budget.
 
 Images alone let a Gaussian slide along its rays as long as the training views agree; the depth term
@@ -21,11 +21,10 @@ from jaxtyping import Bool, Float, Float32, Int64
 
 from bridge.geometry import se3
 from bridge.terminal import Advance
-from twin.scene.fit.appearance import (
+from twin.scene.fit.exposure import (
     UNLIMITED,
     Allowance,
     ImageObservation,
-    solve_appearance,
     solve_gains,
 )
 from twin.scene.frames.rgbd import TrainingView
@@ -122,8 +121,7 @@ class FitState:
     seconds: float = 0.0
     """Time spent so far."""
     events_done: int = 0
-    """How much of the schedule of colour solutions and splits is behind."""
-    colour_steps: int = 0
+    """How much of the schedule of exposures and splits is behind."""
     errors: list[float] = field(default_factory=list)
     """Mean squared errors of the last images."""
 
@@ -243,19 +241,14 @@ def _halves(cloud: GaussianCloud) -> list[GaussianCloud]:
 
 COARSE = 0.6
 """Share of the budget spent at half resolution."""
-APPEARANCE_STEPS = 4
-"""Conjugate gradient steps whenever the colours are solved; more than six follow the noise."""
 DEPTH_WEIGHT = 0.5
 """Of the L1 depth term (the paper's lambda_d), relative to depth."""
-SOLVE_AT = (0.9,)
-"""Shares of the budget at which colours are solved. Not at the start: a sharp solution for blurred
-Gaussians leads Adam astray (0.4 dB of 34 on the clean tabletop); near the end it adds 0.2 dB."""
-EXPOSURES_AT = (0.1, 0.3, 0.6)
-"""Shares of the budget at which exposures are solved, besides with the colours."""
+EXPOSURES_AT = (0.1, 0.3, 0.6, 0.9)
+"""Shares of the budget at which exposures are solved."""
 SPLIT_AT = (0.1, 0.25, 0.4, 0.6)
 """Shares of the budget at which Gaussians are split and dropped. The last one is where images are
 of full size by default: they show errors of a texture that half-size ones have averaged away."""
-SOLVE_SHARE, EXPOSURES_SHARE, SPLIT_SHARE = 0.08, 0.02, 0.04
+EXPOSURES_SHARE, SPLIT_SHARE = 0.02, 0.04
 """At most this much of the budget for each of them."""
 
 
@@ -295,7 +288,6 @@ class Events:
         planned: list[tuple[float, float, Act]] = [
             *((at, SPLIT_SHARE, self._densify) for at in SPLIT_AT),
             *((at, EXPOSURES_SHARE, self._solve_exposures) for at in EXPOSURES_AT),
-            *((at, SOLVE_SHARE, self._solve_colours) for at in SOLVE_AT),
         ]
         self._schedule = sorted(planned, key=lambda event: event[0])
         """When, in which share of the budget at most, and what."""
@@ -323,21 +315,6 @@ class Events:
         seen = self._observations(state, coarse)
         cloud = state.session.cloud
         state.gains = solve_gains(cloud, seen, self._rasteriser, allowance)
-
-    def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
-        self._solve_exposures(state, coarse, allowance)
-        cloud = state.session.cloud
-        solved, steps = solve_appearance(
-            cloud,
-            self._observations(state, coarse),
-            self._rasteriser,
-            steps=APPEARANCE_STEPS,
-            allowance=allowance,
-        )
-        keep_colors_in_range(solved)
-        state.colour_steps += steps
-        cloud.colors[:] = solved.colors
-        cloud.harmonics[:] = solved.harmonics
 
     def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         cloud = state.session.cloud
@@ -396,8 +373,6 @@ class FitResult:
     gains: Float[np.ndarray, "num_views 3"]
     """How the colours of the scene came out in each training image; on average they did not
     change."""
-    colour_steps: int
-    """Conjugate gradient steps that solved colours; 0 when there was no time for them."""
 
     @property
     def underfitted(self) -> bool:
@@ -449,7 +424,6 @@ def fit(
         seconds=state.seconds,
         train_psnr_db=_recent_psnr_db(state, len(views)),
         gains=state.gains,
-        colour_steps=state.colour_steps,
     )
 
 

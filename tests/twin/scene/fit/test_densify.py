@@ -5,7 +5,7 @@ import pytest
 import textured_room
 
 from bridge.geometry import se3
-from twin.scene.fit.appearance import ImageObservation
+from twin.scene.fit.exposure import ImageObservation
 from twin.scene.fit.initialise import fuse
 from twin.scene.fit.optimise import Scores, densify, score
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
