@@ -5,13 +5,13 @@ import pytest
 import textured_room
 
 from twin.scene import gaussians
-from twin.scene.fit import exposure
-from twin.scene.fit.exposure import gain_between, solve_gains
+from twin.scene.fit import optimise
 from twin.scene.fit.initialise import fuse
+from twin.scene.fit.optimise import gain_between, solve_gains
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser
 
-Room = tuple[gaussians.GaussianCloud, list[exposure.ImageObservation]]
+Room = tuple[gaussians.GaussianCloud, list[optimise.ImageObservation]]
 LIMITS = DepthLimits(max_depth_m=5.0, flying_fraction=0.1)
 GAINS = np.array([[1.1, 0.9, 1.0], [0.8, 1.2, 1.05], [1.1, 0.9, 0.95]])
 
@@ -27,7 +27,7 @@ def room() -> Room:
         mask = view.half.static_mask.copy()
         mask[5:12, 6 + 4 * index : 14 + 4 * index] = False
         observations.append(
-            exposure.ImageObservation(
+            optimise.ImageObservation(
                 target=replace(view.half, static_mask=mask),
                 T_base_camera=view.T_base_color,
                 gain=GAINS[index],

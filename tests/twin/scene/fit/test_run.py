@@ -5,9 +5,8 @@ import pytest
 import textured_room
 
 from twin.scene.fit import optimise
-from twin.scene.fit.exposure import ImageObservation
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import fit
+from twin.scene.fit.optimise import ImageObservation, fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud, arrays
 from twin.scene.raster.rasteriser import psnr_db
