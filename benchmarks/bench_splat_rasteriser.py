@@ -19,7 +19,7 @@ from twin.scene.gaussians import (
 )
 from twin.scene.movable_scene import Frame, MovableScene
 from twin.scene.objects.decompose import ObjectSplats
-from twin.scene.raster.rasteriser import NAMES, FitSession, RasterConfig, Rasteriser, available_isas
+from twin.scene.raster.rasteriser import NAMES, FitSession, RasterConfig, Rasteriser, load_native
 
 VGA = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 SMALL = Camera(width=160, height=120, fx=160.0, fy=160.0, cx=80.0, cy=60.0)
@@ -84,7 +84,7 @@ def against_torch(repeats: int) -> Target:
         )
         drawn.sum().backward()
 
-    wide = "v3" if "v3" in available_isas() else "auto"
+    wide = "v3" if "v3" in load_native().available_isas() else "auto"
     rasteriser = Rasteriser(RasterConfig(threads=1, isa=wide))
     slow = statistics.median(cpu_seconds(reference, repeats=2))
     own = statistics.median(cpu_seconds(lambda: native(cloud, SMALL, rasteriser), repeats=repeats))

@@ -16,7 +16,7 @@ from bridge.geometry.camera import Camera
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
 from twin.scene.raster import backend as cuda_module
 from twin.scene.raster.backend import CudaMissingError, CudaRasteriser, open_rasteriser
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, available_isas
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
 from twin.scene.render import render
 from twin.scene.settings import RenderConfig
 
@@ -34,7 +34,7 @@ def beside(name: str) -> Any:
 
 splat_reference = beside("splat_reference")
 CAMERA = Camera(width=45, height=37, fx=50.0, fy=48.0, cx=21.3, cy=19.1)
-ISAS = available_isas()
+ISAS = load_native().available_isas()
 
 
 BOX = ([-0.6, -0.5, 0.8], [0.6, 0.5, 2.5])

@@ -1,8 +1,8 @@
 """Fit Gaussians to images: half size first, then full size, for a time or a number of images.
 
-Adam moves everything. Between its steps exposures and colours are solved in closed form
-(``appearance``) and Gaussians are split where the error is large (``densify``). Each of these looks
-at many images at once, so none may take more than its share of the budget.
+Adam moves everything. Between its steps exposures are solved in closed form and Gaussians are split
+where the error is large (``densify``). Each of these looks at many images at once, so none may take
+more than its share of the budget.
 
 Images alone let a Gaussian slide along its rays as long as the training views agree; the depth term
 sees only the mean depth of a pixel, so Gaussians before and behind the surface cancel in it. From
@@ -21,14 +21,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 
 from bridge.geometry import se3
 from bridge.terminal import Advance
-from twin.scene.fit.appearance import (
-    UNLIMITED,
-    Allowance,
-    ImageObservation,
-    solve_appearance,
-    solve_gains,
-)
-from twin.scene.frames.rgbd import TrainingView
+from twin.scene.frames.rgbd import Target, TrainingView
 from twin.scene.gaussians import (
     GaussianCloud,
     arrays,
@@ -45,6 +38,72 @@ from twin.scene.raster.rasteriser import (
     psnr_db,
 )
 from twin.scene.settings import FitConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Allowance:
+    """Time until which a stage may run, by the clock of the fit."""
+
+    clock: Callable[[], float] = time.monotonic
+    until_s: float = math.inf
+    """On that clock; infinite when images are counted instead of time."""
+
+    def is_over(self) -> bool:
+        """Say whether nothing more should be begun."""
+        return self.clock() >= self.until_s
+
+
+UNLIMITED = Allowance()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageObservation:
+    """One image at one size, where it was seen from, and how its colours came out."""
+
+    target: Target
+    T_base_camera: Float[np.ndarray, "4 4"]
+    gain: Float[np.ndarray, "3"]
+    """Times the scene's colour gives the recorded one: a factor per channel."""
+
+
+SATURATED = 250 / 255
+"""A channel brighter than this no longer follows the exposure."""
+GAIN_PRIOR = 1e-3
+"""Pull of a gain towards 1, as a mean squared brightness: decides only black images."""
+
+
+def solve_gains(
+    cloud: GaussianCloud,
+    observations: Sequence[ImageObservation],
+    rasteriser: Rasteriser,
+    allowance: Allowance = UNLIMITED,
+) -> Float[np.ndarray, "num_views 3"]:
+    """How each image's colours come from the drawn ones; on average they do not change.
+
+    All images twice as bright and all colours half as bright would look the same: the mean over the
+    images is held at no change. Least squares over static pixels that are not saturated. Images
+    that there is no time for keep the gains they have.
+    """
+    gains = np.array([item.gain for item in observations], dtype=np.float64)
+    for index, item in enumerate(observations):
+        if allowance.is_over():
+            break
+        planes = rasteriser.draw_planes(cloud, item.target.camera, item.T_base_camera)
+        gains[index] = gain_between(planes[:3], item.target)
+    return np.asarray(gains / gains.mean(axis=0))
+
+
+def gain_between(
+    drawn: Float32[np.ndarray, "3 height width"], target: Target
+) -> Float[np.ndarray, "3"]:
+    """The factor per channel that brings a drawn image closest to the recorded one."""
+    wanted = target.image()
+    usable = target.static_mask & (wanted < SATURATED).all(axis=0)
+    recorded, own = wanted[:, usable].astype(np.float64), drawn[:, usable].astype(np.float64)
+    prior = GAIN_PRIOR * max(int(usable.sum()), 1)
+    both = (recorded * own).sum(axis=1) + prior
+    return np.asarray(both / (np.square(own).sum(axis=1) + prior))
+
 
 SLAB = 0.5
 """How far a Gaussian may leave the surface that depth fused, along its normal, in its size."""
@@ -122,8 +181,7 @@ class FitState:
     seconds: float = 0.0
     """Time spent so far."""
     events_done: int = 0
-    """How much of the schedule of colour solutions and splits is behind."""
-    colour_steps: int = 0
+    """How much of the schedule of exposures and splits is behind."""
     errors: list[float] = field(default_factory=list)
     """Mean squared errors of the last images."""
 
@@ -182,7 +240,8 @@ def score(
             break
         camera, mask = item.target.camera, item.target.static_mask
         planes = rasteriser.draw_planes(cloud, camera, item.T_base_camera)
-        wrong = np.abs(item.exposed(planes[:3]) - item.target.image()).mean(axis=0) * mask
+        exposed = planes[:3] * item.gain.astype(np.float32)[:, None, None]
+        wrong = np.abs(exposed - item.target.image()).mean(axis=0) * mask
         lifted = rasteriser.lift(np.stack([wrong, mask.astype(np.float32)]))
         error += lifted[:, 0]
         pixels += lifted[:, 1]
@@ -243,19 +302,14 @@ def _halves(cloud: GaussianCloud) -> list[GaussianCloud]:
 
 COARSE = 0.6
 """Share of the budget spent at half resolution."""
-APPEARANCE_STEPS = 4
-"""Conjugate gradient steps whenever the colours are solved; more than six follow the noise."""
 DEPTH_WEIGHT = 0.5
 """Of the L1 depth term (the paper's lambda_d), relative to depth."""
-SOLVE_AT = (0.9,)
-"""Shares of the budget at which colours are solved. Not at the start: a sharp solution for blurred
-Gaussians leads Adam astray (0.4 dB of 34 on the clean tabletop); near the end it adds 0.2 dB."""
-EXPOSURES_AT = (0.1, 0.3, 0.6)
-"""Shares of the budget at which exposures are solved, besides with the colours."""
+EXPOSURES_AT = (0.1, 0.3, 0.6, 0.9)
+"""Shares of the budget at which exposures are solved."""
 SPLIT_AT = (0.1, 0.25, 0.4, 0.6)
 """Shares of the budget at which Gaussians are split and dropped. The last one is where images are
 of full size by default: they show errors of a texture that half-size ones have averaged away."""
-SOLVE_SHARE, EXPOSURES_SHARE, SPLIT_SHARE = 0.08, 0.02, 0.04
+EXPOSURES_SHARE, SPLIT_SHARE = 0.02, 0.04
 """At most this much of the budget for each of them."""
 
 
@@ -295,7 +349,6 @@ class Events:
         planned: list[tuple[float, float, Act]] = [
             *((at, SPLIT_SHARE, self._densify) for at in SPLIT_AT),
             *((at, EXPOSURES_SHARE, self._solve_exposures) for at in EXPOSURES_AT),
-            *((at, SOLVE_SHARE, self._solve_colours) for at in SOLVE_AT),
         ]
         self._schedule = sorted(planned, key=lambda event: event[0])
         """When, in which share of the budget at most, and what."""
@@ -323,21 +376,6 @@ class Events:
         seen = self._observations(state, coarse)
         cloud = state.session.cloud
         state.gains = solve_gains(cloud, seen, self._rasteriser, allowance)
-
-    def _solve_colours(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
-        self._solve_exposures(state, coarse, allowance)
-        cloud = state.session.cloud
-        solved, steps = solve_appearance(
-            cloud,
-            self._observations(state, coarse),
-            self._rasteriser,
-            steps=APPEARANCE_STEPS,
-            allowance=allowance,
-        )
-        keep_colors_in_range(solved)
-        state.colour_steps += steps
-        cloud.colors[:] = solved.colors
-        cloud.harmonics[:] = solved.harmonics
 
     def _densify(self, state: FitState, coarse: bool, allowance: Allowance) -> None:
         cloud = state.session.cloud
@@ -396,8 +434,6 @@ class FitResult:
     gains: Float[np.ndarray, "num_views 3"]
     """How the colours of the scene came out in each training image; on average they did not
     change."""
-    colour_steps: int
-    """Conjugate gradient steps that solved colours; 0 when there was no time for them."""
 
     @property
     def underfitted(self) -> bool:
@@ -449,7 +485,6 @@ def fit(
         seconds=state.seconds,
         train_psnr_db=_recent_psnr_db(state, len(views)),
         gains=state.gains,
-        colour_steps=state.colour_steps,
     )
 
 

@@ -42,11 +42,6 @@ def load_native() -> ModuleType:
         raise SplatExtensionMissingError(reason=str(error)[:160]) from error
 
 
-def available_isas() -> list[str]:
-    """Instruction sets that this processor and this build have, the plainest first."""
-    return [str(name) for name in load_native().available_isas()]
-
-
 @dataclass(frozen=True, kw_only=True)
 class RasterConfig:
     """How precisely to draw."""

@@ -9,7 +9,7 @@ import pytest
 import textured_room
 
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import APPEARANCE_STEPS, FitResult, fit
+from twin.scene.fit.optimise import FitResult, fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import FitSession, Rasteriser
@@ -73,19 +73,6 @@ def test_a_budget_is_exceeded_by_one_image_however_long_all_images_take(
     found = fitted(room, clock)
     assert BUDGET.budget_s <= found.seconds <= BUDGET.budget_s + STEP_S + draw_s + 1e-6
     assert clock.now_s - 1000.0 == pytest.approx(found.seconds)
-
-
-def test_colours_are_solved_with_as_many_steps_as_there_is_time_for(
-    room: tuple[GaussianCloud, list[TrainingView]], clock: DrawingClock
-) -> None:
-    # Eighty images; the late solution may take 0.8 s, of which gains are the first 80 drawings.
-    steps = {}
-    for draw_s in (0.0, 0.0018, 0.3):
-        clock.draw_s = draw_s
-        steps[draw_s] = fitted(room, clock).colour_steps
-    assert steps[0.0] == APPEARANCE_STEPS
-    assert 2 <= steps[0.0018] < APPEARANCE_STEPS
-    assert steps[0.3] == 0
 
 
 def test_an_unfinished_look_at_the_images_drops_no_gaussian_as_unseen(

@@ -5,9 +5,8 @@ import pytest
 import textured_room
 
 from bridge.geometry import se3
-from twin.scene.fit.appearance import ImageObservation
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import Scores, densify, score
+from twin.scene.fit.optimise import ImageObservation, Scores, densify, score
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, training_view
 from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser

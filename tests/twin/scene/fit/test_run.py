@@ -5,9 +5,8 @@ import pytest
 import textured_room
 
 from twin.scene.fit import optimise
-from twin.scene.fit.appearance import ImageObservation
 from twin.scene.fit.initialise import fuse
-from twin.scene.fit.optimise import fit
+from twin.scene.fit.optimise import ImageObservation, fit
 from twin.scene.frames.rgbd import DepthLimits, FrameSurface, TrainingView, training_view
 from twin.scene.gaussians import GaussianCloud, arrays
 from twin.scene.raster.rasteriser import psnr_db
@@ -41,7 +40,6 @@ def test_frames_of_different_exposure_are_told_from_the_scene(
     config = FitConfig(iterations=30, threads=1)
     told = fit(start, exposed, config, lambda *_: None)
     monkeypatch.setattr(optimise, "EXPOSURES_AT", ())
-    monkeypatch.setattr(optimise, "SOLVE_AT", ())
     untold = fit(start, exposed, config, lambda *_: None)
     assert told.train_psnr_db > untold.train_psnr_db + 1.0
     np.testing.assert_allclose(told.gains.mean(axis=0), 1.0, rtol=1e-9)

@@ -8,7 +8,7 @@ from splat_pull import pull_back
 
 from bridge.geometry.camera import Camera
 from twin.scene.gaussians import GaussianCloud, arrays, as_float32
-from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, available_isas
+from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, load_native
 
 CAMERA = Camera(width=50, height=35, fx=60.0, fy=60.0, cx=25.0, cy=17.5)
 """Neither edge is a whole number of tiles."""
@@ -32,7 +32,7 @@ def drawn(cloud: GaussianCloud, config: RasterConfig) -> Rasteriser:
     return rasteriser
 
 
-@pytest.mark.parametrize("isa", available_isas())
+@pytest.mark.parametrize("isa", load_native().available_isas())
 @pytest.mark.parametrize("channels", [1, 5, 16, 33])
 def test_lifting_is_the_adjoint_of_drawing(isa: str, channels: int) -> None:
     cloud = shiny_cloud(800)
@@ -87,7 +87,7 @@ STRANGE = st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e30, -1e30, 1e-30, -50
         max_size=12,
     ),
     size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
-    isa=st.sampled_from(available_isas()),
+    isa=st.sampled_from(load_native().available_isas()),
 )
 def test_strange_gaussians_and_sizes_never_spoil_the_image(
     spoiled: list[tuple[str, int, float]], size: tuple[int, int], isa: str
