@@ -12,7 +12,6 @@ from twin.scene.semantics.lift import render_labels
 from twin.scene.semantics.points import SurfacePoints, points_of
 from twin.scene.semantics.segment import Segmentation, segment
 
-
 WHITE = (0.85, 0.85, 0.85)
 
 
