@@ -32,8 +32,8 @@ from twin.scene.shape.known import pose_of
 
 MIN_SPLATS = 20
 """Of a known object with fewer Gaussians nothing can be said."""
-NEAR_POINT_M = 0.02
-"""Gaussians farther from all points of the fused surface belong to no thing."""
+NEAR_POINT_M, NEAR_SIGMAS = 0.015, 2.0
+"""Gaussians farther from the fused surface's next point, and in its sigmas, are of no thing."""
 CELL_M = 0.004
 """Gaussians of a scene lie about this far apart."""
 MIN_SHOWN_PX = 20.0
@@ -117,11 +117,9 @@ def scene_by_default(
         surfaces_m = {key: se3.apply(T_level_base, p) for key, p in surfaces_m.items()}
     labels = np.zeros(len(cloud), dtype=np.uint16)
     found = segment(points)
-    far_m, nearest = cKDTree(points.p_m).query(
-        cloud.means_m[ids], distance_upper_bound=NEAR_POINT_M
-    )
-    of_point = np.append(found.labels, 0)  # the query gives the number of points where none is near
-    labels[ids] = np.where(np.isfinite(far_m), of_point[nearest], 0)
+    far_m, nearest = cKDTree(points.p_m).query(cloud.means_m[ids])
+    reach_m = np.maximum(NEAR_POINT_M, NEAR_SIGMAS * np.exp(searched.scales_log.max(axis=1)))
+    labels[ids] = np.where(far_m < reach_m[nearest], found.labels[nearest], 0)
     things, remark = found.things, found.remark
     advance(FOUND, f"{len(things)} things found")
     keys, others, labels = numbered(labels, known)

@@ -66,7 +66,8 @@ MARKING = 0.25
 TOUCH_M, MAX_LIFT_M = 0.015, 0.2
 """What begins higher over the plane stands on something, or hangs."""
 MIN_SHARE = 0.15
-"""Of what touches and has its colour: smaller is a part."""
+"""Of what touches and has its colour: smaller is a part, unless it is ``TOWERS`` times as high."""
+TOWERS = 2.0
 MAX_OVERLAP = 0.35
 """Of one outline seen from above within another of its colour: more is one thing."""
 
@@ -353,7 +354,8 @@ def _smallest_part(
             continue
         all_ = own | np.isin(pieces, others)
         touch_m = max(TOUCH_M, 0.25 * float(height_m[all_].max()))
-        is_small = counts[piece] < MIN_SHARE * all_.sum()
+        top_m, beside_m = (np.quantile(height_m[each], 0.97) for each in (own, all_ & ~own))
+        is_small = counts[piece] < MIN_SHARE * all_.sum() and top_m < TOWERS * beside_m
         if is_small or np.quantile(height_m[own], 0.03) > touch_m:
             return int(piece), int(others[np.argmax(strength)])
         for other in others:

@@ -277,10 +277,12 @@ def make_world(
         for index in range(total)
     ]
     train, held_out = shots[:num_train], shots[num_train:]
+    return World(pieces, names or TABLETOP_NAMES, train, held_out, fused(train))
+
+
+def fused(shots: Sequence[Shot]) -> GaussianCloud:
     limits = DepthLimits(max_depth_m=2.0, flying_fraction=0.03)
-    clouds = [FrameSurface(shot.frame, limits).points() for shot in train]
-    cloud = fuse(clouds, 45_000)
-    return World(pieces, names or TABLETOP_NAMES, train, held_out, cloud)
+    return fuse([FrameSurface(shot.frame, limits).points() for shot in shots], 45_000)
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:

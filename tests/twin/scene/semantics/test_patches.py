@@ -122,6 +122,12 @@ def test_cubes_that_touch_are_two_by_their_colours_or_by_a_step() -> None:
     assert len(on_plane(*large, *standing(0.12, 0.12, RED))) == 1
 
 
+def test_what_is_small_beside_a_thing_of_its_colour_is_a_part_unless_it_towers_over_it() -> None:
+    papers = face([-0.15, -0.15, 0.012], [0.3, 0, 0], [0, 0.3, 0], RED)
+    assert len(on_plane(papers, *standing(0.18, 0.05, RED))) == 2
+    assert len(on_plane(papers, *standing(0.162, 0.02, RED))) == 1
+
+
 def test_a_label_belongs_to_what_it_is_on() -> None:
     label = face([0.0605, -0.02, 0.04], [0, 0.04, 0], [0, 0, 0.04], BLUE)
     assert len(on_plane(*standing(0.0, 0.12, RED), label)) == 1

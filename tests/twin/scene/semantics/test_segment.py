@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import table_scene
@@ -9,6 +11,8 @@ from twin.scene.semantics.describe import scene_by_default
 from twin.scene.semantics.lift import render_labels
 from twin.scene.semantics.points import SurfacePoints, points_of
 from twin.scene.semantics.segment import Segmentation, segment
+
+WHITE = (0.85, 0.85, 0.85)
 
 
 def segmented(pieces: list[table_scene.Piece], num: int = 8) -> tuple[World, Segmentation]:
@@ -93,6 +97,16 @@ def test_what_stands_on_in_or_beside_another_thing_is_its_own(
     for (label, score), wanted in zip(best.values(), labels, strict=True):
         assert label.startswith(wanted)
         assert score > least
+
+
+def test_every_fifth_frame_shows_the_same_things_as_all() -> None:
+    papers = box(1, [0.02, 0, 0.01], [0.22, 0.20, 0.02], WHITE)
+    mug = box(2, [-0.123, 0.03, 0.04], [0.05, 0.05, 0.08], WHITE)
+    world = make_world([table(), papers, mug], num_held_out=0, noise_m=0.003)
+    for cloud in (world.cloud, table_scene.fused(world.train[::5])):
+        found = segment(points_of(cloud))
+        assert len(found.things) == 2
+        assert all(score > 0.8 for _, score in matched(replace(world, cloud=cloud), found).values())
 
 
 def test_without_a_level_plane_it_says_what_is_missing() -> None:

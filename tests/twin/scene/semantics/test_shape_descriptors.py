@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from twin.scene.semantics.shape_descriptors import find_height_map_cavity, height_map, measure_shape
 
@@ -13,12 +14,7 @@ def from_above(height: np.ndarray, half_m: float = 0.06) -> np.ndarray:
     points = [np.column_stack([x.ravel(), y.ravel(), height.ravel()])]
     for level in np.arange(0.002, height.max(), 0.003):
         inside = height > level
-        edge = inside & ~(
-            np.roll(inside, 1, 0)
-            & np.roll(inside, -1, 0)
-            & np.roll(inside, 1, 1)
-            & np.roll(inside, -1, 1)
-        )
+        edge = inside & ~ndimage.binary_erosion(inside, border_value=1)
         points.append(np.column_stack([x[edge], y[edge], np.full(edge.sum(), level)]))
     p = np.concatenate(points)
     return p[p[:, 2] > 0]
@@ -40,18 +36,12 @@ def test_an_open_box_has_its_cavity() -> None:
     assert measured.cavity.floor_m == pytest.approx(0.006, abs=0.002)
 
 
-def test_a_gap_of_one_cell_does_not_drain_the_cavity() -> None:
+def test_a_gap_of_one_cell_does_not_drain_the_cavity_and_a_missing_wall_does() -> None:
     x, y = grid()
     reach = np.maximum(np.abs(x), np.abs(y))
     height = np.where(reach > 0.052, 0.05, 0.006)
     height[:6, 40:42] = 0.006
     assert measure_shape(from_above(height), CELL_M).word == "open container"
-
-
-def test_a_missing_wall_does() -> None:
-    x, y = grid()
-    reach = np.maximum(np.abs(x), np.abs(y))
-    height = np.where(reach > 0.052, 0.05, 0.006)
     height[-8:] = 0.006
     assert measure_shape(from_above(height), CELL_M).cavity is None
 
