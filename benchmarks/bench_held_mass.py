@@ -154,13 +154,9 @@ def main() -> None:
             for how in ("recorded", "bad sensors"):
                 label = f"{cell_name}, {how}"
                 rows[label] = found[how]
-                good, held = (sum(map(test, found[how])) for test in (right, covers))
-                targets.append(
-                    Target(what=f"{label}: right", measured=good, limit=20, at_most=False)
-                )
-                targets.append(
-                    Target(what=f"{label}: hold", measured=held, limit=18, at_most=False)
-                )
+                for name, test, limit in (("right", right, 20), ("hold", covers, 18)):
+                    what, good = f"{label}: {name}", sum(map(test, found[how]))
+                    targets.append(Target(what=what, measured=good, limit=limit, at_most=False))
             rows[f"{cell_name}, not lifted"] = found["not lifted"]
             said = sum("mass_kg" in row for row in found["not lifted"])
             note = f"of {len(found['not lifted'])}"
