@@ -97,6 +97,12 @@ LEAVES: dict[str, Leaf] = {
             """,
         ),
     ),
+    "depth from colour": Leaf(
+        modules=("twin.sweep",),
+        extra="twin",
+        purpose="rebuilding from colour alone",
+        entries={"estimate": "twin.sweep.estimate:estimated_depth"},
+    ),
     "policies": Leaf(
         modules=("twin.policies",),
         extra="policies",
