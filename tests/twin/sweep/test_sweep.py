@@ -1,10 +1,16 @@
 """A sweep against planes whose distance is known at every pixel, by rays cast onto them."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import robot_gst
+from bridge.episode.reader import Episode
 from bridge.geometry import se3
 from bridge.geometry.camera import Camera
+from bridge.media.color import encode_jpeg
 from twin.sweep.planes import PosedImage, sweep
 
 CAMERA = Camera(width=96, height=72, fx=90.0, fy=90.0, cx=48.0, cy=36.0)
@@ -50,8 +56,24 @@ def test_a_textured_plane_is_found_where_it_is(normal: tuple[float, float, float
     assert np.quantile(off, 0.9) < 0.05
 
 
-def test_an_image_without_neighbours_has_no_depth() -> None:
-    images, _ = capture((0.0, 0.0, 1.0))
-    depth_m, confirmed = swept([images[0], images[0]])
-    assert not depth_m.any()
-    assert confirmed == 0.0
+@pytest.mark.parametrize(("contrast", "code"), [(0.0, 1), (0.6, 0)])
+def test_textured_images_are_rebuilt_and_even_ones_refused_before_the_fit(
+    contrast: float, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = []
+    for number, each in enumerate(capture((0.2, -0.4, 1.0))[0]):
+        grey = 255 * np.clip(0.5 + contrast * (each.grey - 0.5), 0.0, 1.0)
+        image = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+        (tmp_path / f"{number}.jpg").write_bytes(encode_jpeg(image))
+        T = each.T_base_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"{number}.jpg", "transform_matrix": T.tolist()})
+    about = {"w": CAMERA.width, "h": CAMERA.height, "fl_x": CAMERA.fx, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(about))
+    run = tmp_path / "run"
+    assert robot_gst.run(["import", "rgbd", str(tmp_path), str(run), "--quiet"]) == 0
+    topics = Episode.open(run / "episodes" / "scan.mcap").topics()
+    assert not any(topic.endswith("depth/image") for topic in topics)
+    assert robot_gst.run(["rebuild", str(run), "--quiet", "--iterations", "3"]) == code
+    assert ("do not agree on one" in capsys.readouterr().err) == bool(code)
+    if code == 0:
+        assert "depth estimated from colour" in (run / "scene" / "scene.json").read_text()
