@@ -92,10 +92,14 @@ LEAVES: dict[str, Leaf] = {
         commands=commands_of(
             REBUILD,
             "twin.scene.foundation.cli",
-            """
-            find | Find things of the scene by words. | runs/x "the box's rim"
-            """,
+            'find | Find things of the scene by words. | runs/x "the box\'s rim"',
         ),
+    ),
+    "depth from colour": Leaf(
+        modules=("twin.sweep",),
+        extra="twin",
+        purpose="rebuilding from colour alone",
+        entries={"estimate": "twin.sweep.estimate:estimated_depth"},
     ),
     "policies": Leaf(
         modules=("twin.policies",),
@@ -169,9 +173,7 @@ LEAVES: dict[str, Leaf] = {
         commands=commands_of(
             RECORD,
             "bridge.sources.ur.cli",
-            """
-            publish ur | A UR arm: joints, tool, gripper, modes. | 192.168.1.10 --cell lab
-            """,
+            "publish ur | A UR arm: joints, tool, gripper, modes. | 192.168.1.10 --cell lab",
         ),
     ),
     "realsense": Leaf(
@@ -181,9 +183,7 @@ LEAVES: dict[str, Leaf] = {
         commands=commands_of(
             RECORD,
             "bridge.sources.realsense.cli",
-            """
-            publish realsense | RealSense cameras: colour, depth. | --camera side=123622270224
-            """,
+            "publish realsense | RealSense cameras: colour, depth. | --camera side=123622270224",
         ),
     ),
     "lerobot": Leaf(

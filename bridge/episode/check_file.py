@@ -13,12 +13,7 @@ from mcap.summary import Summary
 from bridge.episode.mcap.damaged import RecordFile
 from bridge.episode.mcap.data_walk import DataWalk, ScannedMessage
 from bridge.episode.mcap.format import FileSummary
-from bridge.episode.mcap.walk import (
-    DAMAGE,
-    read_footer,
-    read_header,
-    read_summary,
-)
+from bridge.episode.mcap.walk import DAMAGE, read_footer, read_header, read_summary
 
 
 def summary_faults(seen: FileSummary, summary: Summary | None) -> Iterator[str]:

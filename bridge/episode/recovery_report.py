@@ -6,18 +6,8 @@ from pathlib import Path
 from mcap.records import Attachment, Channel, DataEnd, Header, McapRecord, Metadata, Schema
 
 from bridge.episode import provenance
-from bridge.episode.mcap.damaged import (
-    RecordFile,
-    summary_definitions,
-)
-from bridge.episode.mcap.scan import (
-    Chunk,
-    Damage,
-    Found,
-    IndexSpan,
-    Plain,
-    TopMessage,
-)
+from bridge.episode.mcap.damaged import RecordFile, summary_definitions
+from bridge.episode.mcap.scan import Chunk, Damage, Found, IndexSpan, Plain, TopMessage
 from bridge.episode.metadata import from_strings, to_strings
 
 RECORD_NAME = "recovered"

@@ -20,13 +20,7 @@ from bridge.record.config import BYTES_PER_MB, RecorderConfig
 from bridge.record.episode_recording import EpisodeRecording
 from bridge.record.errors import DiskError, LifecycleError, NoSpaceError
 from bridge.record.presence import News
-from bridge.record.queue import (
-    Command,
-    Dropped,
-    Item,
-    LatchedMessages,
-    LatchedTopics,
-)
+from bridge.record.queue import Command, Dropped, Item, LatchedMessages, LatchedTopics
 from bridge.task.task_file import TaskFile
 
 

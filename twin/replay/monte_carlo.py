@@ -18,12 +18,7 @@ from bridge.geometry import se3
 from bridge.task.task_file import ObjectModel, Task
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.unseen import draw_unseen
-from twin.replay.config import (
-    UNKNOWN_POSE_M,
-    UNKNOWN_POSE_RAD,
-    PosteriorDraw,
-    ReplayConfig,
-)
+from twin.replay.config import UNKNOWN_POSE_M, UNKNOWN_POSE_RAD, PosteriorDraw, ReplayConfig
 from twin.replay.deciding import LEVEL, goes_with_success, what_decides
 from twin.replay.scene import ReplayScene
 from twin.scene.shape.known import yaw_period_rad

@@ -17,12 +17,7 @@ from bridge.task.plan import Plan
 from bridge.task.task_file import Task
 from bridge.task.verdict import Factor, Verdict
 from twin.physics.engines import engine_version
-from twin.replay.checks import (
-    limited_to_task,
-    start_failures,
-    stops_of_arm,
-    task_failures,
-)
+from twin.replay.checks import limited_to_task, start_failures, stops_of_arm, task_failures
 from twin.replay.clearance.monitor import ClearanceMonitor
 from twin.replay.clearance.surroundings import posture_clearance
 from twin.replay.config import ReplayConfig

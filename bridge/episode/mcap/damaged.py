@@ -7,21 +7,8 @@ from dataclasses import dataclass, field
 from mcap.records import McapRecord, Schema
 
 from bridge.episode.mcap import format as mcap
-from bridge.episode.mcap.format import (
-    CHANNEL,
-    MESSAGE,
-    RECORD_HEAD,
-    SCHEMA,
-    Buffer,
-    crc32,
-)
-from bridge.episode.mcap.walk import (
-    BrokenRecordError,
-    ByteStream,
-    parse,
-    read_footer,
-    records_in,
-)
+from bridge.episode.mcap.format import CHANNEL, MESSAGE, RECORD_HEAD, SCHEMA, Buffer, crc32
+from bridge.episode.mcap.walk import BrokenRecordError, ByteStream, parse, read_footer, records_in
 
 BLOCK_BYTES = 1 << 20
 

@@ -12,14 +12,7 @@ from mcap import records
 from bridge.episode.mcap import format as mcap_format
 from bridge.episode.mcap.damaged import Contents, RecordFile
 from bridge.episode.mcap.format import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, FileSummary
-from bridge.episode.mcap.scan import (
-    Chunk,
-    Damage,
-    IndexSpan,
-    Plain,
-    TopMessage,
-    scan,
-)
+from bridge.episode.mcap.scan import Chunk, Damage, IndexSpan, Plain, TopMessage, scan
 from bridge.episode.mcap.walk import (
     MessageHead,
     attachment_entry,

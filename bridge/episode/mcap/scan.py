@@ -13,13 +13,7 @@ from mcap.records import Chunk as ChunkRecord
 from mcap.records import McapRecord
 
 from bridge.episode.mcap import format as mcap
-from bridge.episode.mcap.damaged import (
-    BLOCK_BYTES,
-    Contents,
-    RecordFile,
-    read_plain,
-    walk_records,
-)
+from bridge.episode.mcap.damaged import BLOCK_BYTES, Contents, RecordFile, read_plain, walk_records
 from bridge.episode.mcap.walk import (
     MAX_CHUNK_BYTES,
     BrokenRecordError,

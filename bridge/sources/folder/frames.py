@@ -26,10 +26,10 @@ Image = TypeVar("Image")
 
 @dataclass(frozen=True, kw_only=True)
 class FolderFrame:
-    """The files of one instant."""
+    """The files of one instant, without depth where there is none."""
 
     color_path: Path
-    depth_path: Path
+    depth_path: Path | None
     T_world_depth: Float[np.ndarray, "4 4"]
     color_stamp_ns: int | None = None
     """When the colour image was taken, where the folder says so [ns]."""

@@ -161,22 +161,20 @@ def _images(
     stamps: tuple[int, int],
 ) -> list[StampedMessage]:
     color_ns, depth_ns = stamps
-    depth = DepthImage(
-        stamp_ns=depth_ns,
-        frame_id=f"{config.camera}_depth_optical",
-        depth_mm=_read_depth(index, frame),
-    )
+    prefix = camera_topic(config.cell, config.camera)
     image = CompressedColor(
         stamp_ns=color_ns,
         frame_id=f"{config.camera}_color_optical",
         format="jpeg",
         data=color.as_jpeg(),
     )
-    prefix = camera_topic(config.cell, config.camera)
-    return [
-        stamped(f"{prefix}{DEPTH_IMAGE}", schema.IMAGE, depth.to_cdr(), depth_ns),
-        stamped(f"{prefix}{COLOR_IMAGE}", schema.COMPRESSED_IMAGE, image.to_cdr(), color_ns),
-    ]
+    cdr = image.to_cdr()
+    images = [stamped(f"{prefix}{COLOR_IMAGE}", schema.COMPRESSED_IMAGE, cdr, color_ns)]
+    if frame.depth_path:
+        depth_mm, frame_id = _read_depth(index, frame.depth_path), f"{config.camera}_depth_optical"
+        depth = DepthImage(stamp_ns=depth_ns, frame_id=frame_id, depth_mm=depth_mm)
+        images.insert(0, stamped(f"{prefix}{DEPTH_IMAGE}", schema.IMAGE, depth.to_cdr(), depth_ns))
+    return images
 
 
 def _calibration(
@@ -203,9 +201,9 @@ def stamped(topic: str, type_name: str, data: bytes, stamp_ns: int) -> StampedMe
     return StampedMessage(topic=topic, type_name=type_name, data=data, stamp_ns=stamp_ns)
 
 
-def _read_depth(index: FolderIndex, frame: FolderFrame) -> UInt16[np.ndarray, "height width"]:
-    stored = read_stored_depth(frame.depth_path)
-    check_size(frame.depth_path, stored.shape, index.depth_camera)
+def _read_depth(index: FolderIndex, path: Path) -> UInt16[np.ndarray, "height width"]:
+    stored = read_stored_depth(path)
+    check_size(path, stored.shape, index.depth_camera)
     depth_mm = to_millimetres(
         stored,
         unit_m=index.depth_unit_m,
@@ -215,7 +213,7 @@ def _read_depth(index: FolderIndex, frame: FolderFrame) -> UInt16[np.ndarray, "h
     was_measured = ~np.isin(stored, [0, *index.depth_invalid_values])
     if was_measured.any() and not depth_mm.any():
         raise FolderError(
-            path=frame.depth_path,
+            path=path,
             found=f"with {index.depth_unit_m:g} m for each stored number no pixel lies between "
             "0.5 mm and 65.5 m",
             hint="Correct the unit: depth_unit_m in scene.json, else --depth-unit-m.",
@@ -252,7 +250,8 @@ def find_frames(folder: Path) -> list[Path]:
 
 def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read a sequence folder."""
-    frames, num_unposed = [], 0
+    frames: list[FolderFrame] = []
+    num_unposed = width = height = 0
     for color_path in find_frames(folder):
         stem = color_path.name.split(".")[0]
         depth_path = require_image(
@@ -264,6 +263,8 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         if T_world_depth is None:
             num_unposed += 1
             continue
+        if not frames:
+            height, width = read_stored_depth(depth_path).shape
         frames.append(
             FolderFrame(color_path=color_path, depth_path=depth_path, T_world_depth=T_world_depth)
         )
@@ -271,7 +272,6 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         raise FolderError(
             path=folder, found="no frame has a pose", hint="Add frame-XXXXXX.pose.txt files."
         )
-    size = read_stored_depth(frames[0].depth_path).shape[::-1]
     given = _read_intrinsics(folder / INTRINSICS_FILE)
     depth, color = config.depth_intrinsics or given, config.color_intrinsics
     T_color_depth = se3.from_rotation(np.eye(3), T_COLOR_DEPTH_NOMINAL_M)
@@ -283,10 +283,10 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         depth_invalid_values=INVALID_VALUES,
         depth_encoding="",
         depth_camera=camera_of(
-            depth, DEPTH_INTRINSICS, size, option="--depth-intrinsics", path=folder
+            depth, DEPTH_INTRINSICS, (width, height), option="--depth-intrinsics", path=folder
         ),
         color_camera=camera_of(
-            color, COLOR_INTRINSICS, size, option="--color-intrinsics", path=folder
+            color, COLOR_INTRINSICS, (width, height), option="--color-intrinsics", path=folder
         ),
         T_depth_color=se3.invert(T_color_depth),
         frames=tuple(frames),

@@ -1,4 +1,4 @@
-"""The layout of NeRF programs: ``transforms.json`` with depth images beside the colour ones.
+"""The layout of NeRF programs: ``transforms.json``, with depth images beside colour or without.
 
 Poses go from camera to world with OpenGL's axes (+Y up, +Z backwards); depth is registered to
 colour. Lenses that bend straight lines are refused.
@@ -43,7 +43,7 @@ def read_transforms(folder: Path, config: FolderConfig) -> FolderIndex:
     refuse_scale_without_use(replace(config, depth_unit_m=None), path)
     record, entries = _load(path)
     keys = Counter(record.keys())
-    frames, cameras, assumed = [], set(), {"registration": "depth is registered to colour"}
+    frames, cameras, assumed = [], set(), {"registration": "any depth is registered to colour"}
     for number, frame in enumerate(entries, start=1):
         if not isinstance(frame, dict):
             raise FolderError(path=path, found=f"frame {number} is no object")
@@ -52,13 +52,11 @@ def read_transforms(folder: Path, config: FolderConfig) -> FolderIndex:
         cameras.add(camera)
         if is_centred:
             assumed["principal point"] = "the centre of the image"
-        if not frame.get("depth_file_path"):
-            found = f"frame {number} has no depth_file_path"
-            raise FolderError(path=path, found=found, hint="A scene is rebuilt from depth images.")
+        depth = frame.get("depth_file_path")
         frames.append(
             FolderFrame(
                 color_path=_image_below(folder, str(frame.get("file_path", ""))),
-                depth_path=_image_below(folder, str(frame["depth_file_path"])),
+                depth_path=_image_below(folder, str(depth)) if depth else None,
                 T_world_depth=_frame_pose(path, number, frame),
             )
         )
@@ -66,6 +64,8 @@ def read_transforms(folder: Path, config: FolderConfig) -> FolderIndex:
         found = f"{len(cameras)} different cameras in {len(frames)} frames"
         raise FolderError(path=path, found=found, hint="One folder is of one camera; split it.")
     (camera,) = cameras
+    depths = [frame.depth_path for frame in frames if frame.depth_path is not None]
+    shown = read_stored_depth(depths[0]).shape[1] if depths else camera.width
     unit = config.depth_unit_m or record.get("depth_unit_scale_factor", DEPTH_UNIT_M)
     return FolderIndex(
         path=path,
@@ -74,7 +74,7 @@ def read_transforms(folder: Path, config: FolderConfig) -> FolderIndex:
         depth_unit_m=_number(path, unit, "depth_unit_scale_factor"),
         depth_invalid_values=(0,),
         depth_encoding="",
-        depth_camera=camera.scaled(read_stored_depth(frames[0].depth_path).shape[1] / camera.width),
+        depth_camera=camera.scaled(shown / camera.width),
         color_camera=camera,
         T_depth_color=np.eye(4),
         frames=tuple(sorted(frames, key=lambda frame: str(frame.color_path))),

@@ -102,7 +102,6 @@ STRETCHED = {**PLAIN, "transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}
         ({"frames": [PLAIN]}, "transform_matrix"),
         ({"frames": [OUTSIDE | {"transform_matrix": TURNED}]}, "secret"),
         ({"frames": [STRETCHED]}, "rotation"),
-        ({"frames": [{**PLAIN, "depth_file_path": ""}]}, "frame 1 has no depth_file_path"),
         ({"frames": [{**PLAIN, "transform_matrix": TURNED, "fl_x": f} for f in (20, 30)]}, "2 dif"),
         ({"frames": None}, "no list of frames"),
         ({"frames": [{**PLAIN, "file_path": "a\0b"}]}, "image not found"),

@@ -12,17 +12,7 @@ from twin.plan.constrain.bodies import surface_points
 from twin.plan.constrain.constraint import Constraint, violated
 from twin.plan.constrain.kinds import compile_constraint
 from twin.plan.constrain.schema import values_of
-from twin.plan.problem import (
-    Array,
-    Grasp,
-    Miss,
-    NoPlanError,
-    Pose,
-    Poses,
-    Problem,
-    Release,
-    State,
-)
+from twin.plan.problem import Array, Grasp, Miss, NoPlanError, Pose, Poses, Problem, Release, State
 from twin.plan.release.obstacles import hand_points, obstacles_of
 from twin.plan.release.resting import (
     Target,
@@ -32,14 +22,7 @@ from twin.plan.release.resting import (
     support_m,
     target_of,
 )
-from twin.plan.stage.solver import (
-    ANGLE_RAD,
-    StageProblem,
-    StageState,
-    distinct,
-    perturbed,
-    solve,
-)
+from twin.plan.stage.solver import ANGLE_RAD, StageProblem, StageState, distinct, perturbed, solve
 from twin.robot.collision import hulls_of
 
 TAU_P_M = 0.02

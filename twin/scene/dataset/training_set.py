@@ -1,5 +1,6 @@
 """Read the training frames once: points, views, what moved, and whether the scan makes sense."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -29,6 +30,8 @@ from twin.scene.settings import RebuildConfig
 MAX_POINTS = 3_000_000
 """Depth points to fuse; more change nothing but the time."""
 DOWNSCALED_PX = 120
+ESTIMATED = DepthLimits(max_depth_m=math.inf, flying_fraction=0.15)
+"""Neighbouring pixels of estimated depth differ by more, and are of one surface."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,9 +92,12 @@ def read_training_set(
     if not read.views:
         message = "no frame of this run has colour, depth and a pose together. Record it again."
         raise NoFramesError(message)
-    report = check_scan(read.cameras, config.frames)
-    report = check_geometry(read.cameras, report, config.frames)
-    report = replace(report, found=(*report.found, *_colour_remarks(read)))
+    is_measured = not any(choice.estimated_m for choice in choices)
+    report = ScanReport(poses={}, found=())
+    if is_measured:
+        report = check_scan(read.cameras, config.frames)
+        report = check_geometry(read.cameras, report, config.frames)
+        report = replace(report, found=(*report.found, *_colour_remarks(read)))
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     for choice in choices:
         robot.look_closer(choice, limits_of(config), stride)
@@ -100,7 +106,8 @@ def read_training_set(
     points, views, choice_of_view = read.points, read.views, read.choice_of_view
     paths = [choice.episode.path for choice in choices]
     scans = [paths.index(paths[index]) for index in choice_of_view]
-    reference_views = choose_reference_views(views, scans)
+    # Estimated depth is off by more than what moves: it speaks against no surface.
+    reference_views = choose_reference_views(views, scans) if is_measured else []
     bare = [
         placements.take_out(choices[index].episode, points[place], views[place])
         for place, index in enumerate(choice_of_view)
@@ -144,10 +151,11 @@ def _read(
     read = _Read()
     with output.progress("read frames", total) as advance:
         for index, choice in enumerate(choices):
+            limits = ESTIMATED if choice.estimated_m else limits_of(config)
             images: list[DownscaledDepth] = []
             trusted = []
             for frame in load(choice, choice.train_ns):
-                surface = FrameSurface(frame, limits_of(config))
+                surface = FrameSurface(frame, limits)
                 seen = surface.points(_stride(total, frame.depth_m.size))
                 view = training_view(surface)
                 seen, view = robot.take_out(choice.episode, frame, seen, view)
@@ -182,7 +190,7 @@ def _set_ego_pixels_aside(
         mine = [place for place, owner in enumerate(read.choice_of_view) if owner == index]
         views = [read.views[place] for place in mine]
         asked = [find_dark_rim] if views else []
-        if not (choice.stationary or robot.knows(choice.episode)):
+        if not (choice.stationary or choice.estimated_m or robot.knows(choice.episode)):
             asked.append(find_ego_mask)
         masks = [mask for mask in (ask(views) for ask in asked) if mask is not None]
         if not masks:

@@ -20,7 +20,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.scene.frames.odometry import CameraPath, follow_camera
-from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns
+from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns, streams_of
 from twin.scene.settings import FrameConfig
 from twin.scene.store.calibration import (
     Calibration,
@@ -210,6 +210,12 @@ def find_poses(
         poses = CameraPoses(tree=tree, source="tf", unposed_ns=unposed)
         _say_unposed(poses, episode, camera_id, stamps_ns, output)
         return poses
+    if streams_of(episode, camera_id) == ("color",):
+        message = (
+            f"/tf does not say where {name_of(episode, camera_id)} was, and without depth its "
+            "images cannot be followed. Record its poses, or depth."
+        )
+        raise UnusableCameraError(message)
     bare = _bare_tree(tree, episode, camera_id)
     with output.progress(f"follow camera {camera_id}", len(stamps_ns)) as advance:
         path = follow_camera(
@@ -329,8 +335,7 @@ def places_camera(tree: TransformTree, episode: Episode, camera_id: str) -> bool
     if frame not in tree.frames():
         return False
     root = tree.root_of(frame)
-    own = {frame, streams.camera_info(episode, camera_id, "depth").frame_id}
-    return root not in own and not root.startswith(f"{camera_id}_")
+    return root not in _frame_ids(episode, camera_id) and not root.startswith(f"{camera_id}_")
 
 
 def _bare_tree(tree: TransformTree, episode: Episode, camera_id: str) -> TransformTree:
@@ -365,10 +370,10 @@ def _root_name(episode: Episode, camera_id: str) -> str:
 
 
 def _frame_ids(episode: Episode, camera_id: str) -> tuple[str, str]:
-    color, depth = (
-        streams.camera_info(episode, camera_id, stream).frame_id for stream in ("color", "depth")
-    )
-    return color, depth
+    """Of colour and depth; of colour twice where no depth was recorded."""
+    found = streams_of(episode, camera_id)
+    ids = [streams.camera_info(episode, camera_id, stream).frame_id for stream in found]
+    return ids[0], ids[-1]
 
 
 def _describe(path: CameraPath, num_lost: int) -> str:

@@ -10,13 +10,22 @@ from bridge.errors import BridgeError
 from twin.errors import TwinError
 
 
+def streams_of(episode: Episode, camera_id: str) -> tuple[str, ...]:
+    """``color``, and ``depth`` where it was recorded."""
+    has_depth = streams.find_camera_topic(episode, camera_id, "depth/image") is not None
+    return ("color", "depth") if has_depth else ("color",)
+
+
 def paired_stamps_ns(episode: Episode, camera_id: str) -> Int[np.ndarray, " num_frames"]:
     """Source stamps of the colour images that ``streams.rgbd_frames`` makes frames of, ascending.
 
     Colour without depth nearby is not among them, and of two colour images beside one depth image
-    only that which gets it.
+    only that which gets it. Of a camera without depth, all are.
     """
-    found = {color.stamp_ns for color, _ in streams.rgbd_pairs(episode, camera_id)}
+    if streams_of(episode, camera_id) == ("color",):
+        found = {color.stamp_ns for color in streams.color_images(episode, camera_id)}
+    else:
+        found = {color.stamp_ns for color, _ in streams.rgbd_pairs(episode, camera_id)}
     return np.array(sorted(found), dtype=np.int64)
 
 
@@ -36,7 +45,7 @@ def check_camera(episode: Episode, camera_id: str) -> None:
         UnusableCameraError: The lens turns back, intrinsics are missing or of another image size,
             or an image cannot be read.
     """
-    for stream in ("color", "depth"):
+    for stream in streams_of(episode, camera_id):
         try:
             camera = streams.camera_info(episode, camera_id, stream).camera
             size = _first_size(episode, camera_id, stream)

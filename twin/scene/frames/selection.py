@@ -4,11 +4,11 @@ A scan holds far more frames than a fit can use: they are taken at even distance
 camera's path, so that one that pauses gives no more of them there.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from bridge.episode import streams
 from bridge.episode.metadata import RETRY
@@ -20,16 +20,13 @@ from bridge.errors import BridgeError
 from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.errors import TwinError
-from twin.scene.frames.camera_poses import (
-    CameraPoses,
-    find_poses,
-    never_moves,
-)
+from twin.scene.frames.camera_poses import CameraPoses, find_poses, never_moves
 from twin.scene.frames.pairing import (
     UnusableCameraError,
     check_camera,
     name_of,
     paired_stamps_ns,
+    streams_of,
 )
 from twin.scene.settings import FrameConfig
 from twin.scene.store.calibration import Calibration
@@ -63,6 +60,8 @@ STATIONARY_TRAIN_FRAMES = 4
 STATIONARY_HOLDOUT_FRAMES = 2
 """A camera that stands still shows the same again and again; this many frames are enough."""
 QUIET = Output(quiet=True)
+COLOR_ALONE, COLOR_AND_DEPTH = (COLOR_INFO,), (COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
+"""What a camera records beside its colour images."""
 
 
 class NoFramesError(TwinError):
@@ -84,6 +83,14 @@ class FrameChoice:
     poses: CameraPoses
     spare_ns: frozenset[int] = frozenset()
     """Neither chosen nor held out: the background does not need them, the robot may."""
+    estimated_m: Mapping[int, Float32[np.ndarray, "height width"]] = field(default_factory=dict)
+    """Depth of images beside which none was recorded, at a whole fraction of their size; 0 where it
+    is not known."""
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth was recorded."""
+        return streams_of(self.episode, self.camera_id) == ("color", "depth")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,18 +114,20 @@ class Sources:
 def find_sources(run: RunFolder) -> Sources:
     """Take all scans; else what has posed RGB-D frames and is no trial; else the trials.
 
-    An episode that cannot be read is passed over, with a remark.
+    An episode that cannot be read is passed over, with a remark. Colour images without depth count
+    where there is nothing else.
     """
     usable: list[Episode] = []
     broken: list[BridgeError] = []
     for path in run.episodes():
         try:
             episode = Episode.open(path)
-            if rgbd_camera_ids(episode):
+            if rgbd_camera_ids(episode, COLOR_ALONE):
                 usable.append(episode)
         except BridgeError as error:
             broken.append(error)
     remarks = [f"passed over: {error}" for error in broken]
+    usable = [episode for episode in usable if rgbd_camera_ids(episode)] or usable
     scans = [episode for episode in usable if episode.info.kind == "scan"]
     if scans:
         return Sources(episodes=tuple(scans), remark="; ".join(remarks))
@@ -127,8 +136,7 @@ def find_sources(run: RunFolder) -> Sources:
     if not usable:
         message = (
             f"no episode in {run.episodes_dir} has colour and depth images with intrinsics. "
-            "Record a scan, or import a folder: robot-gst import rgbd FOLDER RUN. Images without "
-            "depth can be looked at, and not rebuilt."
+            "Record a scan, or import a folder: robot-gst import rgbd FOLDER RUN."
         )
         raise NoFramesError(message)
     usable = [episode for episode in usable if episode.info.kind not in ("trial", RETRY)] or usable
@@ -139,11 +147,10 @@ def find_sources(run: RunFolder) -> Sources:
     return Sources(episodes=tuple(usable), remark="; ".join(remarks))
 
 
-def rgbd_camera_ids(episode: Episode) -> list[str]:
+def rgbd_camera_ids(episode: Episode, others: tuple[str, ...] = COLOR_AND_DEPTH) -> list[str]:
     """Cameras with colour and depth, both with intrinsics; never those of stand-in truth."""
     topics = {topic for topic in episode.topics() if not is_truth(topic)}
     stems = {topic.removesuffix(COLOR_IMAGE) for topic in topics if topic.endswith(COLOR_IMAGE)}
-    others = (COLOR_INFO, DEPTH_IMAGE, DEPTH_INFO)
     return sorted(
         stem.split("/")[-1] for stem in stems if all(stem + ending in topics for ending in others)
     )
@@ -165,7 +172,7 @@ def choose_frames(
     found = [
         (episode, camera_id)
         for episode in sources.episodes
-        for camera_id in rgbd_camera_ids(episode)
+        for camera_id in rgbd_camera_ids(episode) or rgbd_camera_ids(episode, COLOR_ALONE)
     ]
     shared = replace(
         config,
@@ -275,9 +282,35 @@ def spread(values: np.ndarray, count: int) -> np.ndarray:
 
 def load(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
     """Yield the frames of a choice that carry one of the stamps, with the poses it chose."""
+    if not choice.has_depth:
+        yield from _without_depth(choice, stamps_ns)
+        return
     tree = choice.poses.tree
     for frame in streams.rgbd_frames(choice.episode, choice.camera_id, tree, stamps_ns):
         yield with_true_depth(frame, choice.poses)
+
+
+def _without_depth(choice: FrameChoice, stamps_ns: frozenset[int]) -> Iterator[RgbdFrame]:
+    """Colour images with the depth that was estimated for them, or none."""
+    info = streams.camera_info(choice.episode, choice.camera_id)
+    camera = info.camera
+    nothing = np.zeros((camera.height, camera.width), dtype=np.float32)
+    for color in streams.color_images(choice.episode, choice.camera_id):
+        if color.stamp_ns in stamps_ns:
+            depth_m = choice.estimated_m.get(color.stamp_ns, nothing)
+            factor = camera.width // depth_m.shape[1]
+            height, width = (side * factor for side in depth_m.shape)
+            T = choice.poses.tree.T_root_frame(info.frame_id, color.stamp_ns)
+            yield RgbdFrame(
+                camera_id=choice.camera_id,
+                stamp_ns=color.stamp_ns,
+                image_u8=color.image_u8(),
+                depth_m=depth_m,
+                color_camera=camera,
+                depth_camera=replace(camera, width=width, height=height).scaled(1 / factor),
+                T_base_color=T,
+                T_base_depth=T,
+            )
 
 
 def with_true_depth(frame: RgbdFrame, poses: CameraPoses) -> RgbdFrame:

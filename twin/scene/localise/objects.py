@@ -38,12 +38,7 @@ from twin.scene.localise.points import (
     moved,
     object_points,
 )
-from twin.scene.localise.result import (
-    LocalisedObject,
-    found_by_box,
-    found_by_fit,
-    missing,
-)
+from twin.scene.localise.result import LocalisedObject, found_by_box, found_by_fit, missing
 from twin.scene.localise.soft import LEAST_HEIGHT_M, SoftFit, fit_toys
 from twin.scene.shape.known import yaw_period_rad
 

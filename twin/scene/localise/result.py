@@ -11,12 +11,7 @@ from bridge.geometry import se3
 from bridge.task.record import check_record
 from bridge.task.task_file import SCANNED, ObjectModel
 from twin.scene.localise.mesh_fit import MeshFit
-from twin.scene.shape.known import (
-    pose_of,
-    rectangle_yaw_rad,
-    surface_distances,
-    turned_alike,
-)
+from twin.scene.shape.known import pose_of, rectangle_yaw_rad, surface_distances, turned_alike
 
 SCHEMA_VERSION = 1
 METHOD = "colour_shape_fit"

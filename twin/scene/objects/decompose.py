@@ -30,13 +30,7 @@ from bridge.whole_file import write_whole
 from twin.scene.fit.initialise import flat_gaussians
 from twin.scene.fit.lighting import EVEN, Lighting
 from twin.scene.frames.rgbd import TrainingView
-from twin.scene.gaussians import (
-    GaussianCloud,
-    concatenate,
-    moved_cloud,
-    read_ply,
-    write_ply,
-)
+from twin.scene.gaussians import GaussianCloud, concatenate, moved_cloud, read_ply, write_ply
 from twin.scene.objects.closing import closed_object
 from twin.scene.objects.placement import Placements
 from twin.scene.shape.from_training import ObjectViews, is_known, shapes_of, write_static

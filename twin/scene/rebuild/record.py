@@ -75,9 +75,11 @@ def protocol_of(
     training = "of the others, evenly along the camera's path"
     if frames.train_every:
         training = f"frame 0 and every {frames.train_every}th after it, but no held-out one"
+    is_estimated = any(choice.estimated_m for choice in choices)
+    estimated = "; depth was estimated from colour" if is_estimated else ""
     return {
         "holdout": f"frame {frames.holdout_every // 2} and every {frames.holdout_every}th after it "
-        f"of each camera, at most {frames.max_holdout_frames} in all",
+        f"of each camera, at most {frames.max_holdout_frames} in all{estimated}",
         "training": training,
         "train_frames": sum(len(choice.train_ns) for choice in choices),
         "cameras_from": sorted({SAYS[choice.poses.source] for choice in choices}),

@@ -65,6 +65,9 @@ def rebuild(run: RunFolder, config: RebuildConfig, output: Output) -> dict[str, 
     refuse_full(run.scene_dir)
     began_s = time.monotonic()
     chosen = choose_frames(sources, config.frames, output, calibration)
+    if not all(choice.has_depth for choice in chosen.choices):
+        estimate = load_leaf("depth from colour", "estimate")
+        chosen = estimate(chosen, config.frames.max_depth_m, output)
     placements = find_placements(sources, chosen.choices, output)
     training = read_training_set(chosen.choices, config, output, placements)
     fitted = _fit(training, config, output)
@@ -151,7 +154,8 @@ def _write_parts(
 ) -> dict[str, Any]:
     """Write objects, robot links, distances and semantics; return what ``scene.json`` says."""
     output.say("write objects, robot links and the distances to what is static")
-    written = decomposed.write(run, training.views, training.views_of) | write_robot(
+    measured = [] if any(choice.estimated_m for choice in training.choices) else training.views
+    written = decomposed.write(run, measured, training.views_of) | write_robot(
         run, training.robot, links
     )
     if not config.models.any_named and not has_leaf("perception"):

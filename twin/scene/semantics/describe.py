@@ -22,12 +22,7 @@ from twin.scene.semantics.masks import associate, observe
 from twin.scene.semantics.points import points_of, solid_splats
 from twin.scene.semantics.segment import SOURCE, segment
 from twin.scene.semantics.shape_descriptors import CONTAINER, find_parts, measure_shape
-from twin.scene.semantics.support import (
-    NoSupportError,
-    SupportPlane,
-    find_support,
-    level_frame,
-)
+from twin.scene.semantics.support import NoSupportError, SupportPlane, find_support, level_frame
 from twin.scene.shape.known import pose_of
 
 MIN_SPLATS = 20

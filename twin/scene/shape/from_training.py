@@ -23,11 +23,7 @@ from twin.scene.frames.rgbd import TrainingView
 from twin.scene.frames.selection import spread
 from twin.scene.shape.carve import MaskedView
 from twin.scene.shape.known import outside_m, pose_of, shape_mesh
-from twin.scene.shape.reconstruct import (
-    ObjectShape,
-    reconstruct,
-    shape_of_mesh,
-)
+from twin.scene.shape.reconstruct import ObjectShape, reconstruct, shape_of_mesh
 from twin.scene.shape.static import everything_in, static_sdf
 from twin.scene.store.library import SDF
 

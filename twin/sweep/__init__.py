@@ -1,0 +1,1 @@
+"""Depth of posed colour images from each other, where none was recorded."""
