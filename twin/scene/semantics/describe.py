@@ -27,7 +27,7 @@ from twin.scene.shape.known import pose_of
 
 MIN_SPLATS = 20
 """Of a known object with fewer Gaussians nothing can be said."""
-NEAR_POINT_M, NEAR_SIGMAS = 0.015, 2.0
+NEAR_POINT_M, NEAR_SIGMAS = 0.0175, 2.0
 """Gaussians farther from the fused surface's next point, and in its sigmas, are of no thing."""
 CELL_M = 0.004
 """Gaussians of a scene lie about this far apart."""
