@@ -92,7 +92,7 @@ def draw_beforehand(count: int, movers: Mapping[str, ObjectModel]) -> list[Poste
     unit = qmc.Sobol(d=6 + 4 * len(movers), scramble=True, seed=0).random(count)
     z = ndtri(np.clip(unit, 1e-6, 1 - 1e-6))
     frictions = FRICTION[0] * (FRICTION[1] / FRICTION[0]) ** unit[:, :2]
-    factors = np.exp(UNKNOWN_LOG * z[:, 2:4])
+    factors, normals = np.exp(UNKNOWN_LOG * z[:, 2:4]), z[:, 6:].reshape(count, len(movers), 4)
     return [
         PosteriorDraw(
             finger_pair_friction=float(finger),
@@ -101,22 +101,15 @@ def draw_beforehand(count: int, movers: Mapping[str, ObjectModel]) -> list[Poste
             grip_scale=float(grip),
             bias_m=(float(bias[0]), float(bias[1])),
             unseen=tuple(
-                (
-                    name,
-                    draw_unseen(
-                        np.array(model.size_m),
-                        float(row[0]),
-                        ndtri(np.clip(row[1:], 1e-6, 1 - 1e-6)),
-                    ),
-                )
-                for (name, model), row in zip(movers.items(), rows, strict=True)
+                (name, draw_unseen(np.array(model.size_m), float(share), normal[1:]))
+                for (name, model), share, normal in zip(movers.items(), shares, own, strict=True)
             ),
             weight=1.0 / count,
             wrong_yes=WRONG[0] / sum(WRONG),
             wrong_no=WRONG[0] / sum(WRONG),
         )
-        for (finger, surface), (mass, grip), bias, rows in zip(
-            frictions, factors, BIAS_M * z[:, 4:6], unit[:, 6:].reshape(count, -1, 4), strict=True
+        for (finger, surface), (mass, grip), bias, shares, own in zip(
+            frictions, factors, BIAS_M * z[:, 4:6], unit[:, 6::4], normals, strict=True
         )
     ]
 

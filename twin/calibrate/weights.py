@@ -299,7 +299,8 @@ def weighed(episode: Episode, task: Task) -> list[dict[str, Any]]:
             shown.append((name, weight_of(robot, moved, free, held), held))
         except NoWeightError as error:
             reasons.append(str(error))
-    for name in (pushed := [str(stage["push"]) for stage in task.stages if "push" in stage]):
+    pushed = [str(stage["push"]) for stage in task.stages if "push" in stage]
+    for name in pushed:
         try:
             if len(pushed) > 1:
                 raise NoWeightError(f"{len(pushed)} pushes: nobody said which of them was felt")

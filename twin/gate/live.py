@@ -314,7 +314,8 @@ class LiveView:
         if self._calibration is None or not self._places:
             return "cameras by /tf"
         names, known = ", ".join(sorted(self._places)), self._calibration.calibration_id
-        return f"camera {names} by robot-gst calibrate ({known}), others by /tf"
+        cameras = "cameras" if len(self._places) > 1 else "camera"
+        return f"{cameras} {names} by robot-gst calibrate ({known}), others by /tf"
 
     def urdf(self) -> str | None:
         """The robot description, None before it arrived."""

@@ -28,7 +28,7 @@ FINGER_SPEED_M_S = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class Unseen:
-    """What cameras do not show of a box; nothing: full edges, the weight in the middle."""
+    """What cameras do not show of a box; as built: full edges, the weight in the middle."""
 
     edge_m: float = 0.0
     """Width and depth of a step along every edge: each face is smaller than the box by twice it."""

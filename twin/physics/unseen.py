@@ -21,7 +21,7 @@ EVEN = Unseen()
 
 def draw_unseen(size_m: Float[np.ndarray, "3"], share: float, z: Float[np.ndarray, "3"]) -> Unseen:
     """What a box may hide, from an even share for its edges and three normal numbers."""
-    half_m = np.asarray(size_m) / 2
+    half_m = size_m / 2
     along_x, along_y, along_z = (half_m * np.clip(CENTRE_OF_MASS * z, -0.9, 0.9)).tolist()
     edge_m = EDGE_SHARE * share * float(half_m.min())
     return Unseen(edge_m=edge_m, centre_of_mass_m=(along_x, along_y, along_z))

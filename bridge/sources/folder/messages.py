@@ -168,13 +168,12 @@ def _images(
         format="jpeg",
         data=color.as_jpeg(),
     )
-    cdr = image.to_cdr()
-    images = [stamped(f"{prefix}{COLOR_IMAGE}", schema.COMPRESSED_IMAGE, cdr, color_ns)]
-    if frame.depth_path:
-        depth_mm, frame_id = _read_depth(index, frame.depth_path), f"{config.camera}_depth_optical"
-        depth = DepthImage(stamp_ns=depth_ns, frame_id=frame_id, depth_mm=depth_mm)
-        images.insert(0, stamped(f"{prefix}{DEPTH_IMAGE}", schema.IMAGE, depth.to_cdr(), depth_ns))
-    return images
+    seen = stamped(f"{prefix}{COLOR_IMAGE}", schema.COMPRESSED_IMAGE, image.to_cdr(), color_ns)
+    if frame.depth_path is None:
+        return [seen]
+    depth_mm, frame_id = _read_depth(index, frame.depth_path), f"{config.camera}_depth_optical"
+    depth = DepthImage(stamp_ns=depth_ns, frame_id=frame_id, depth_mm=depth_mm)
+    return [stamped(f"{prefix}{DEPTH_IMAGE}", schema.IMAGE, depth.to_cdr(), depth_ns), seen]
 
 
 def _calibration(
@@ -250,8 +249,7 @@ def find_frames(folder: Path) -> list[Path]:
 
 def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
     """Read a sequence folder."""
-    frames: list[FolderFrame] = []
-    num_unposed = width = height = 0
+    frames, depth_paths, num_unposed = list[FolderFrame](), list[Path](), 0
     for color_path in find_frames(folder):
         stem = color_path.name.split(".")[0]
         depth_path = require_image(
@@ -263,8 +261,7 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         if T_world_depth is None:
             num_unposed += 1
             continue
-        if not frames:
-            height, width = read_stored_depth(depth_path).shape
+        depth_paths.append(depth_path)
         frames.append(
             FolderFrame(color_path=color_path, depth_path=depth_path, T_world_depth=T_world_depth)
         )
@@ -272,6 +269,7 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         raise FolderError(
             path=folder, found="no frame has a pose", hint="Add frame-XXXXXX.pose.txt files."
         )
+    size = read_stored_depth(depth_paths[0]).shape[::-1]
     given = _read_intrinsics(folder / INTRINSICS_FILE)
     depth, color = config.depth_intrinsics or given, config.color_intrinsics
     T_color_depth = se3.from_rotation(np.eye(3), T_COLOR_DEPTH_NOMINAL_M)
@@ -283,10 +281,10 @@ def read_sevenscenes(folder: Path, config: FolderConfig) -> FolderIndex:
         depth_invalid_values=INVALID_VALUES,
         depth_encoding="",
         depth_camera=camera_of(
-            depth, DEPTH_INTRINSICS, (width, height), option="--depth-intrinsics", path=folder
+            depth, DEPTH_INTRINSICS, size, option="--depth-intrinsics", path=folder
         ),
         color_camera=camera_of(
-            color, COLOR_INTRINSICS, (width, height), option="--color-intrinsics", path=folder
+            color, COLOR_INTRINSICS, size, option="--color-intrinsics", path=folder
         ),
         T_depth_color=se3.invert(T_color_depth),
         frames=tuple(frames),

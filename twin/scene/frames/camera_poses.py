@@ -20,7 +20,7 @@ from bridge.episode.transforms import TransformTree
 from bridge.geometry import se3
 from bridge.terminal import Output
 from twin.scene.frames.odometry import CameraPath, follow_camera
-from twin.scene.frames.pairing import UnusableCameraError, name_of, paired_stamps_ns, streams_of
+from twin.scene.frames.pairing import UnusableCameraError, has_depth, name_of, paired_stamps_ns
 from twin.scene.settings import FrameConfig
 from twin.scene.store.calibration import (
     Calibration,
@@ -210,7 +210,7 @@ def find_poses(
         poses = CameraPoses(tree=tree, source="tf", unposed_ns=unposed)
         _say_unposed(poses, episode, camera_id, stamps_ns, output)
         return poses
-    if streams_of(episode, camera_id) == ("color",):
+    if not has_depth(episode, camera_id):
         message = (
             f"/tf does not say where {name_of(episode, camera_id)} was, and without depth its "
             "images cannot be followed. Record its poses, or depth."
@@ -371,9 +371,10 @@ def _root_name(episode: Episode, camera_id: str) -> str:
 
 def _frame_ids(episode: Episode, camera_id: str) -> tuple[str, str]:
     """Of colour and depth; of colour twice where no depth was recorded."""
-    found = streams_of(episode, camera_id)
-    ids = [streams.camera_info(episode, camera_id, stream).frame_id for stream in found]
-    return ids[0], ids[-1]
+    color = streams.camera_info(episode, camera_id).frame_id
+    if not has_depth(episode, camera_id):
+        return color, color
+    return color, streams.camera_info(episode, camera_id, "depth").frame_id
 
 
 def _describe(path: CameraPath, num_lost: int) -> str:

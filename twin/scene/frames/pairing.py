@@ -10,10 +10,9 @@ from bridge.errors import BridgeError
 from twin.errors import TwinError
 
 
-def streams_of(episode: Episode, camera_id: str) -> tuple[str, ...]:
-    """``color``, and ``depth`` where it was recorded."""
-    has_depth = streams.find_camera_topic(episode, camera_id, "depth/image") is not None
-    return ("color", "depth") if has_depth else ("color",)
+def has_depth(episode: Episode, camera_id: str) -> bool:
+    """Whether depth images of a camera were recorded."""
+    return streams.find_camera_topic(episode, camera_id, "depth/image") is not None
 
 
 def paired_stamps_ns(episode: Episode, camera_id: str) -> Int[np.ndarray, " num_frames"]:
@@ -22,10 +21,10 @@ def paired_stamps_ns(episode: Episode, camera_id: str) -> Int[np.ndarray, " num_
     Colour without depth nearby is not among them, and of two colour images beside one depth image
     only that which gets it. Of a camera without depth, all are.
     """
-    if streams_of(episode, camera_id) == ("color",):
-        found = {color.stamp_ns for color in streams.color_images(episode, camera_id)}
-    else:
+    if has_depth(episode, camera_id):
         found = {color.stamp_ns for color, _ in streams.rgbd_pairs(episode, camera_id)}
+    else:
+        found = {color.stamp_ns for color in streams.color_images(episode, camera_id)}
     return np.array(sorted(found), dtype=np.int64)
 
 
@@ -45,7 +44,7 @@ def check_camera(episode: Episode, camera_id: str) -> None:
         UnusableCameraError: The lens turns back, intrinsics are missing or of another image size,
             or an image cannot be read.
     """
-    for stream in streams_of(episode, camera_id):
+    for stream in ("color", "depth") if has_depth(episode, camera_id) else ("color",):
         try:
             camera = streams.camera_info(episode, camera_id, stream).camera
             size = _first_size(episode, camera_id, stream)

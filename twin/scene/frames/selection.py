@@ -24,9 +24,9 @@ from twin.scene.frames.camera_poses import CameraPoses, find_poses, never_moves
 from twin.scene.frames.pairing import (
     UnusableCameraError,
     check_camera,
+    has_depth,
     name_of,
     paired_stamps_ns,
-    streams_of,
 )
 from twin.scene.settings import FrameConfig
 from twin.scene.store.calibration import Calibration
@@ -90,7 +90,7 @@ class FrameChoice:
     @property
     def has_depth(self) -> bool:
         """Whether depth was recorded."""
-        return streams_of(self.episode, self.camera_id) == ("color", "depth")
+        return has_depth(self.episode, self.camera_id)
 
 
 @dataclass(frozen=True, kw_only=True)
