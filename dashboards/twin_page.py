@@ -88,7 +88,7 @@ def any_recorded(run: RunFolder, holds: Callable[[Episode], Any]) -> bool:
 
 
 def has_depth(episode: Episode) -> bool:
-    """Whether a camera recorded depth: a scene is made of nothing else."""
+    """Whether a camera recorded depth: without it a scene can be made of moving cameras only."""
     return any(topic.endswith(DEPTH_IMAGE) for topic in episode.topics())
 
 
