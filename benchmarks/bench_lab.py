@@ -6,7 +6,7 @@ objects where the gate localises them in the cell's own images; nobody sees the 
 
     python benchmarks/bench_lab.py --folder runs/lab
 
-Started again it goes on where it was; ``--report`` only prints what there is, and
+Started again, anywhere, it goes on where it was; ``--report`` only prints what there is, and
 ``--development`` takes seeds that are no measurement.
 """
 
@@ -52,7 +52,8 @@ TASKS = (
 )
 """Those of ``lab`` but the soft one, whose replays take seven times as long."""
 CELL, WIRE = "lab_mixed", "lab"
-FIRST, PER_TASK, DEVELOPMENT = 8207, 50, 1_000_200
+FIRST, PER_TASK, DEVELOPMENT = 8208, 50, 1_000_200
+KEPT = ROOT / "benchmarks" / "results" / "lab_mixed"
 LEARNED, JUDGED = 4, 12
 PLANNED, PAIRS = 28, 400
 """Sessions, and pairs of a good and a bad plan: with fewer a result is interim."""
@@ -159,10 +160,9 @@ def judged(run: RunFolder, name: str, seed: int) -> Session:
     return {"task": name, "seed": seed, "not_used": not_used, "first": done, "rows": rows}
 
 
-def session(folder: Path, task: str, seed: int) -> Session:
+def session(folder: Path, task: str, seed: int, done: Path) -> Session:
     """Record and judge what is missing of a session."""
-    path = folder / f"{task}_{seed}"
-    done = path / "judged.json"
+    path = folder / done.stem
     if not done.is_file():
         began_s = time.process_time()
         run = RunFolder.open(path) if path.is_dir() else RunFolder.create(path)
@@ -252,17 +252,17 @@ def main() -> None:
     """Sessions of the tasks in turn, then the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, default=ROOT / "runs" / "lab_mixed")
-    parser.add_argument("--tasks", nargs="*", default=list(TASKS), choices=TASKS)
     parser.add_argument("--sessions", type=int, default=7, help="of each task")
     parser.add_argument("--development", action="store_true")
     parser.add_argument("--report", action="store_true")
     given = parser.parse_args()
     first, found = DEVELOPMENT if given.development else FIRST, []
     for number in range(given.sessions):
-        for task in given.tasks:
+        for task in TASKS:
             seed = first + PER_TASK * TASKS.index(task) + number
-            if not given.report or (given.folder / f"{task}_{seed}" / "judged.json").is_file():
-                found.append(session(given.folder, task, seed))
+            done = (given.folder if given.development else KEPT) / f"{task}_{seed}.json"
+            if not given.report or done.is_file():
+                found.append(session(given.folder, task, seed, done))
     table = with_intervals(found)
     for name, value in table.items():
         print(f"{name:<40} {value['value']:6.2f} [{value['low']:.2f}, {value['high']:.2f}]")
