@@ -93,10 +93,10 @@ def evidence(measurement: Measurement) -> str:
 
 
 def success_share(p_success: Mapping[str, float]) -> str:
-    """Print how many varied replays succeeded, and the interval of that share."""
+    """Print how many varied replays succeeded, and how probable success is by that."""
     low, high = (round(100 * p_success[name]) for name in ("low", "high"))
     counts = f"{p_success['k']:g} of {p_success['n']:g} varied replays succeed"
-    return f"{counts}, {low} to {high}{NARROW}%"
+    return f"{counts}: {100 * p_success['value']:.0f}{NARROW}%, {low} to {high}{NARROW}%"
 
 
 def size_text(num_bytes: int) -> str:

@@ -24,7 +24,7 @@ def test_a_length_keeps_its_unit_on_its_line() -> None:
 
 def test_a_chance_of_success_is_counts_and_whole_percentages() -> None:
     said = {"value": 1.0, "low": 0.5101091635454027, "high": 1.0, "k": 4, "n": 4}
-    assert plain(wording.success_share(said)) == "4 of 4 varied replays succeed, 51 to 100 %"
+    assert plain(wording.success_share(said)) == "4 of 4 varied replays succeed: 100 %, 51 to 100 %"
 
 
 def test_a_verdict_in_rerun_says_what_its_varied_replays_show() -> None:
@@ -43,7 +43,9 @@ def test_a_verdict_in_rerun_says_what_its_varied_replays_show() -> None:
         samples=kept,
     )
     shown = plain(wording.verdict_text(verdict))
-    told = "4 of 4 varied replays succeed, 51 to 100 %; all succeed, so none shows what decides"
+    told = (
+        "4 of 4 varied replays succeed: 100 %, 51 to 100 %; all succeed, so none shows what decides"
+    )
     assert shown == f"✓ accepted: plan, planned, dynamic, pybullet; {told}"
 
 

@@ -449,7 +449,7 @@ class Gate:
             return verdict
         told = f"{p['k']:g} of {p['n']:g} varied replays succeed"
         if abs(p["value"] - p["k"] / p["n"]) > ROUNDING:
-            told += f", and with what this session's trials say of them {p['value']:.0%} would"
+            told += f", and as far as trials bear them out here {p['value']:.0%} would"
         detail = "; ".join(filter(None, (f"{told}, {wanted:.0%} are asked for", verdict.reason)))
         unlikely = Factor(value=False, cause=Cause.PROBABILITY, detail=detail)
         return replace(

@@ -62,7 +62,7 @@ def serve_gate(
             publisher.put(data, source_ns=perception.newest_ns() or session.now_ns())
         seconds = time.monotonic() - started
         p = verdict.p_success
-        share = f" {p['k']:g} of {p['n']:g} samples succeed." if p else ""
+        share = f" {p['k']:g} of {p['n']:g} samples succeed: {p['value']:.0%}." if p else ""
         text = f"{verdict.plan_id}: {WORDS[verdict.accepted]} in {seconds:.1f} s.{share}"
         output.say(printable(f"{text} {verdict.reason or ''}".rstrip()))
         return data

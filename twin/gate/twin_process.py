@@ -41,7 +41,7 @@ class Question:
     max_steps: int
     """Simulated steps, the samples' among them."""
     until: float | None = None
-    """Samples end once it is decided whether more than this share of them succeed."""
+    """Samples end once it is decided whether p_success is more; 0: whether half of them succeed."""
     any_robot: bool = False
     """The scene may be another robot's, for somebody named the robot (``--robot``)."""
 
@@ -157,7 +157,7 @@ def asked(gate: GateConfig, run_path: Path, plan: Plan, seen: ReplayScene) -> Qu
         seen=seen,
         config=config,
         max_steps=gate.max_steps,
-        until=gate.min_p_success or 0.5,
+        until=gate.min_p_success,
         any_robot=bool(gate.robot),
     )
 

@@ -27,6 +27,8 @@ YOUNG_LOG = 0.3
 """Spread of the logarithm of each soft object's Young's modulus."""
 GRIP_DELAY_S = 0.1
 """The gripper lags behind the arm by up to this long, evenly drawn [s]."""
+UNTRIED = (0.1, 0.55)
+"""p_success before any trial: where all samples fail, and how much more where none does."""
 UPRIGHT = 0.98
 """Cosine of the tilt up to which an object stands."""
 RESTS_M = 1e-4
@@ -63,10 +65,8 @@ def with_draw(
         else replace(model, mass_kg=model.mass_kg * draw.mass_scale)
         for name, model in scene.task.objects.items()
     }
-    poses = {}
-    for name, T in scene.Ts_base_object.items():
-        poses[name] = T.copy()
-        poses[name][:2, 3] += draw.bias_m
+    shift = se3.from_rotation(np.eye(3), (*draw.bias_m, 0.0))
+    poses = {name: shift @ T for name, T in scene.Ts_base_object.items()}
     task = replace(scene.task, objects=objects)
     moved = replace(scene, task=task, Ts_base_object=poses, unseen=dict(draw.unseen))
     return moved, replace(config, physics=physics)
@@ -139,11 +139,9 @@ def draw_variation(
 def _varied_model(model: ObjectModel, z: Float[np.ndarray, "2"], mass_log: float) -> ObjectModel:
     if model.fixed:
         return model
-    soft = model.soft
-    if soft is not None:
-        soft = replace(soft, young_pa=soft.young_pa * float(np.exp(YOUNG_LOG * z[1])))
-    mass_kg = model.mass_kg * float(np.exp(mass_log * z[0]))
-    return replace(model, mass_kg=mass_kg, soft=soft)
+    factor, stiffer = np.exp([mass_log * z[0], YOUNG_LOG * z[1]]).tolist()
+    soft = model.soft and replace(model.soft, young_pa=model.soft.young_pa * stiffer)
+    return replace(model, mass_kg=model.mass_kg * factor, soft=soft)
 
 
 def _root(
@@ -196,21 +194,23 @@ def with_samples(
     config: ReplayConfig,
     *,
     identity: str,
-    until: float | None = None,  # stop once it is decided whether more or fewer succeed
+    until: float | None = None,  # stop once p_success is surely more or less; 0: half succeed
 ) -> Verdict:
     """Add the share of ``config.samples`` varied replays that succeed, with its Wilson interval.
 
-    A sample that could not be decided or replayed counts among those that were not accepted. Where
-    there is a posterior, each sample counts with the chance that its answer is right in this
-    session. A yes also gets what decides it as its reason. UsageError for kinematic replays, which
-    move no objects.
+    A sample that could not be decided or replayed counts among those that were not accepted. Each
+    counts with the chance that its answer is right: by the posterior, or in cells nobody tried. A
+    yes also gets what decides it as its reason. UsageError for kinematic replays.
     """
     if not config.samples:
         return verdict
     if config.mode != "dynamic":
-        message = "a kinematic replay moves no objects: it has no success probability. Use dynamic."
-        raise UsageError(message)
+        raise UsageError("a kinematic replay has no success probability: it moves no objects.")
     samples, drawn, total = list[Verdict](), list[dict[str, float]](), 0.0
+    known = config.variation
+    least, more = (0.0, 1.0) if known.posterior else UNTRIED  # draws know how far to trust them
+    if until is not None:  # of the samples
+        until = min(max((until - least) / more, 0.0), 1.0) if until else 0.5
     while (n := len(samples)) < config.samples:
         if until is not None and decided(total, n, until):
             break
@@ -220,14 +220,14 @@ def with_samples(
             samples.append(replay(*varied))
         except GstError:  # this variation cannot be replayed; the others can
             samples.append(replace(verdict, terminal=Factor(value=None), findings=()))
-        likely, good = config.variation.draw_at(halving(n)), samples[n].accepted is True
+        likely, good = known.draw_at(halving(n)), samples[n].accepted is True
         # Of success in the real cell, now that a sample has said so.
         total += good if likely is None else 1.0 - likely.wrong_yes if good else likely.wrong_no
     k, value = sum(sample.accepted is True for sample in samples), total / n
-    low, high = wilson(value, n)
+    shares = zip(("value", "low", "high"), (value, *wilson(value, n)), strict=True)
     verdict = replace(
         verdict,
-        p_success={"value": value, "low": low, "high": high, "k": k, "n": n},
+        p_success={**{name: least + more * share for name, share in shares}, "k": k, "n": n},
         samples=_kept(samples, drawn),
     )
     if verdict.accepted is not True:

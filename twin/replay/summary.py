@@ -135,7 +135,7 @@ def _sample_lines(rows: Rows) -> list[str]:
         if p is not None:
             lines.append(
                 f"  {row['episode']} {row['plan']} {row['trajectory']}: "
-                f"{p['k']:g} of {p['n']:g}, {p['value']:.0%} [{p['low']:.0%}, {p['high']:.0%}]"
+                f"{p['k']:g} of {p['n']:g}, p {p['value']:.0%} [{p['low']:.0%}, {p['high']:.0%}]"
             )
             lines += [f"    {text}" for text in row.get("decides", ())]
     return ["", "varied replays that succeed:", *lines] if lines else []

@@ -44,9 +44,8 @@ def draws(
 
 
 def verdict(accepted: bool | None) -> Verdict:
-    return verdict_of(
-        terminal=Factor(value=accepted, cause="inside" if accepted is False else None)
-    )
+    cause = "inside" if accepted is False else None
+    return verdict_of(terminal=Factor(value=accepted, cause=cause))
 
 
 def test_what_stands_goes_on_standing_and_moves_as_far_as_localisation_is_unsure(
@@ -178,9 +177,11 @@ NOWHERE = ReplayScene(task=load_task("cube_into_box"), Ts_base_object={}, urdf="
 @pytest.mark.parametrize(
     ("answers", "until", "n"),
     [
-        ([True] * 32, 0.5, 7),
-        ([False] * 32, 0.5, 7),
-        ([True, False] * 16, 0.5, 32),
+        ([True] * 32, 0.0, 7),
+        ([False] * 32, 0.0, 7),
+        ([True, False] * 16, 0.0, 32),
+        ([True] * 32, 0.595, 32),  # 0.1 + 0.9 x 0.55: as probable as nine of ten make it
+        ([False] * 32, 0.595, 2),  # 3 / 8 on average, 0.01 at nine of ten
         ([True] * 32, None, 32),
         ([True] * 3 + [False] * 29, 1.0, 4),
     ],
@@ -235,13 +236,9 @@ def test_every_sample_is_another_draw_and_the_share_has_wilsons_interval(
     # Wilson (1927), by hand: centre (k + z2/2) / (n + z2), n = 8, k = 6.
     z2 = stats.norm.ppf(0.975) ** 2
     centre, half = (6 + z2 / 2) / (8 + z2), np.sqrt(z2 * (6 * 2 / 8 + z2 / 4)) / (8 + z2)
-    assert p == {
-        "value": 0.75,
-        "low": pytest.approx(centre - half),
-        "high": pytest.approx(centre + half),
-        "k": 6,
-        "n": 8,
-    }
+    low, high = (0.1 + 0.55 * (centre + sign * half) for sign in (-1, 1))  # nobody tried the cell
+    value = 0.65 * 0.75 + 0.1 * 0.25
+    assert p == pytest.approx({"value": value, "low": low, "high": high, "k": 6, "n": 8})
 
 
 @given(st.lists(st.sampled_from([True, False, None]), max_size=30))
