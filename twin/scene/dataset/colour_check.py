@@ -5,7 +5,7 @@ shifted, late or upside down; points carried from image to image by depth and po
 are brighter, which poses are off, and which images were sent twice.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
+from bridge.episode.reader import RawMessage
 from bridge.geometry import se3
 from twin.scene.dataset.geometry_search import PoseAt
 from twin.scene.frames.downscaled import pixels_of
@@ -49,10 +50,8 @@ BLURRED = 0.78
 SAME_SURFACE = 0.03
 BRIGHTER = 0.14
 """Logarithm of the brightness of neighbours, from which exposure jumps."""
-APART_PX = 2.0
-"""Images between which the camera moved by this much differ."""
-SAME_LEVELS = 0.35
-"""Mean difference of two copies of one image, of 255."""
+APART_M, BEHIND_STAMP = 0.002, 12
+"""Images between which the camera moved or turned by this much differ, from this byte on."""
 FITS_AT_ALL = 0.6
 """Where less of the depth agrees, brightness of the same points says nothing."""
 LOST, FITS = 0.5, 0.75
@@ -62,17 +61,15 @@ LOST, FITS = 0.5, 0.75
 class _Step(NamedTuple):
     """What one image says of a later one."""
 
-    moved_px: float
-    """How far its points moved in the image."""
     brighter: float
     """Logarithm of the brightness of the same points; 0 without any."""
     agreement: float
     """Share of the depth that is the same."""
-    difference: float
-    """Mean difference of the two images, in levels."""
 
 
-def check_colour(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
+def check_colour(
+    views: Sequence[TrainingView], pose_at: PoseAt, sent: Iterable[RawMessage] = ()
+) -> list[str]:
     """What is wrong with the images of one moving camera, one remark each.
 
     Args:
@@ -82,7 +79,11 @@ def check_colour(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
     chosen = [views[k] for k in spread(np.arange(len(views)), MAX_VIEWS)]
     if len(chosen) < FEWEST or chosen[0].half.camera.width < LEAST_WIDTH_PX:
         return []
-    return [*_edges(chosen, pose_at), *_blur(chosen), *_sequence(chosen)]
+    same = [(a, b) for a, b in pairwise(sent) if a.data[BEHIND_STAMP:] == b.data[BEHIND_STAMP:]]
+    apart = [pose_at(a.publish_time_ns) - pose_at(b.publish_time_ns) for a, b in same]
+    copies = sum(float(np.abs(step).max()) > APART_M for step in apart)
+    told = [f"{copies} of its images are copies of the one before"] if copies else []
+    return [*_edges(chosen, pose_at), *_blur(chosen), *told, *_sequence(chosen, copies)]
 
 
 def _grey(target: Target) -> Float[np.ndarray, "height width"]:
@@ -189,24 +190,21 @@ def _blur(views: Sequence[TrainingView]) -> list[str]:
     return ["its images are blurred: most of them have no sharp edge"] if worst > BLURRED else []
 
 
-def _sequence(views: Sequence[TrainingView]) -> list[str]:
-    """Images sent twice, jumps of exposure, and poses that neither neighbour confirms."""
+def _sequence(views: Sequence[TrainingView], copies: int) -> list[str]:
+    """Jumps of exposure, and poses that neither neighbour confirms."""
     steps = [_step(a, b) for a, b in pairwise(views)]
     over = [_step(a, b).agreement for a, b in zip(views, views[2:], strict=False)]
-    twice = sum(each.difference < SAME_LEVELS and each.moved_px > APART_PX for each in steps)
     usual = float(np.median([each.agreement for each in steps]))
     sure = [each.brighter for each in steps if each.agreement > max(FITS * usual, FITS_AT_ALL)]
     jumps = int((np.abs(sure) > BRIGHTER).sum())
     off = [
         views[k]
         for k in range(1, len(views) - 1)
-        if not twice
+        if not copies
         and max(steps[k - 1].agreement, steps[k].agreement) < LOST * usual
         and over[k - 1] > FITS * usual
     ]
     told = []
-    if twice > 1:
-        told.append(f"{twice} of {len(views)} of its images are copies of the one before")
     if jumps > 1:
         told.append(
             f"its exposure jumps between {jumps} of {len(steps)} neighbouring images; fix it while "
@@ -233,10 +231,7 @@ def _step(first: TrainingView, second: TrainingView) -> _Step:
     same = met & (np.abs(measured - z) < SAME_SURFACE * z)
     mine, theirs = _grey(a)[part][known][inside], _grey(b)[row[inside], column[inside]]
     lit = same & (mine > 10) & (theirs > 10) & (mine < 245) & (theirs < 245)
-    away = a.camera.project(p)[0][inside] - np.stack([column, row], axis=1)[inside]
     return _Step(
-        moved_px=float(np.median(np.hypot(*away.T))) if inside.any() else np.inf,
         brighter=float(np.median(np.log(theirs[lit] / mine[lit]))) if lit.sum() > 50 else 0.0,
         agreement=float(same.sum() / max(met.sum(), 1)),
-        difference=float(np.abs(_grey(a) - _grey(b)).mean()),
     )

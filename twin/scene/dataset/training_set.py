@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool
 
+from bridge.episode import streams
 from bridge.episode.reader import Episode
 from bridge.terminal import Output
 from twin.scene.dataset.colour_check import check_colour
@@ -173,10 +174,13 @@ def _colour_remarks(read: _Read) -> list[str]:
     """What is wrong with the colours of moving cameras."""
     found = []
     for index, camera in enumerate(read.cameras):
-        if not camera.choice.stationary:
-            pairs = zip(read.views, read.choice_of_view, strict=True)
-            mine = sorted((v for v, owner in pairs if owner == index), key=lambda v: v.stamp_ns)
-            remarks = check_colour(mine, camera_pose_at(camera.choice))
+        episode, pairs = camera.choice.episode, zip(read.views, read.choice_of_view, strict=True)
+        mine = sorted((v for v, owner in pairs if owner == index), key=lambda v: v.stamp_ns)
+        if mine and not camera.choice.stationary:
+            inside = range(mine[0].stamp_ns, mine[-1].stamp_ns)  # where poses are known
+            topic = streams.find_camera_topic(episode, camera.choice.camera_id, "color/image")
+            sent = (m for m in episode.messages([topic or ""]) if m.publish_time_ns in inside)
+            remarks = check_colour(mine, camera_pose_at(camera.choice), sent)
             found += [f"{camera.name}: {remark}" for remark in remarks]
     return found
 
