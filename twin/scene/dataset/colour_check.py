@@ -44,6 +44,8 @@ SAME_PEAK_PX = 2
 SHIFT_PX, LATE_S = 2.0, 0.015
 """Less, at half size, is what cameras and their calibrations do."""
 DELAYS_S = np.arange(-0.2, 0.2001, 0.005)
+SCALES = np.arange(0.85, 1.1501, 0.01)
+LEAST_SCALE, SAME_SCALE = 0.03, 0.015
 STEP_NS = 20_000_000
 BLURRED = 0.78
 """With more of its gradients left after a further blur an image has no sharp edge."""
@@ -54,8 +56,8 @@ APART_M, BEHIND_STAMP = 0.002, 12
 """Images between which the camera moved or turned by this much differ, from this byte on."""
 FITS_AT_ALL = 0.6
 """Where less of the depth agrees, brightness of the same points says nothing."""
-LOST, FITS = 0.5, 0.75
-"""Of the agreement of its neighbours: a pose with less is off, if they fit without it."""
+LOST, FITS, MORE = 0.72, 0.75, 1.25
+"""Of the usual agreement: a pose with less is off, if its neighbours fit, and more so, without."""
 
 
 class _Step(NamedTuple):
@@ -72,9 +74,7 @@ def check_colour(
 ) -> list[str]:
     """What is wrong with the images of one moving camera, one remark each.
 
-    Args:
-        views: In the order of time.
-        pose_at: Of a camera near by, at any instant: how fast it turned.
+    Views are in the order of time, ``pose_at`` is of a camera near by; ``sent`` are all images.
     """
     chosen = [views[k] for k in spread(np.arange(len(views)), MAX_VIEWS)]
     if len(chosen) < FEWEST or chosen[0].half.camera.width < LEAST_WIDTH_PX:
@@ -82,8 +82,7 @@ def check_colour(
     same = [(a, b) for a, b in pairwise(sent) if a.data[BEHIND_STAMP:] == b.data[BEHIND_STAMP:]]
     apart = [pose_at(a.publish_time_ns) - pose_at(b.publish_time_ns) for a, b in same]
     copies = sum(float(np.abs(step).max()) > APART_M for step in apart)
-    told = [f"{copies} of its images are copies of the one before"] if copies else []
-    return [*_edges(chosen, pose_at), *_blur(chosen), *told, *_sequence(chosen, copies)]
+    return [*_edges(chosen, pose_at), *_blur(chosen), *_sequence(chosen, copies)]
 
 
 def _grey(target: Target) -> Float[np.ndarray, "height width"]:
@@ -98,15 +97,14 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
     some = spread(np.arange(len(views)), EDGE_VIEWS)
     edges = [_edges_of(_grey(view.half)) for view in views]
     jumps = [_jumps_of(view.half.depth_m) for view in views]
-    sides = np.stack([_meeting(edges[k], jumps[k], GRID_PX) for k in some])
-    each = sides.sum(axis=1)
+    each = np.stack([_meeting(edges[k], jumps[k], GRID_PX) for k in some])
     maps = each.mean(axis=0)
     for word, turn in TURNED.items():
-        turned = np.stack([_meeting(turn(edges[k]), jumps[k], GRID_PX).sum(axis=0) for k in some])
+        turned = np.stack([_meeting(turn(edges[k]), jumps[k], GRID_PX) for k in some])
         if _is_sure(turned) and turned.mean(axis=0).max() > LEAST_GAIN**2 * maps.max():
             return [f"its colour images are {word} to its depth"]
     flows = np.array([_flow_px_s(view, pose_at) for view in views])
-    late = np.stack([*map(_meeting, edges, jumps, flows[:, None] * DELAYS_S[:, None])]).sum(axis=1)
+    late = np.stack([*map(_meeting, edges, jumps, flows[:, None] * DELAYS_S[:, None])])
     best, *parts = (int(part.mean(axis=0).argmax()) for part in (late, late[::2], late[1::2]))
     gain = late[:, best] - late[:, len(DELAYS_S) // 2]
     delay_s, differ_s = float(DELAYS_S[best]), abs(float(np.diff(DELAYS_S[parts])[0]))
@@ -116,10 +114,11 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
         word = "later" if delay_s > 0 else "earlier"
         return [f"its colour was taken {1e3 * abs(delay_s):.0f} ms {word} than its depth"]
     here = LEAST_GAIN * float(maps[np.abs(GRID_PX).max(axis=1) <= 1].max())
-    wider = [_peak(half[:, 1])[0] - _peak(half[:, 0])[0] for half in (sides[::2], sides[1::2])]
-    sure = abs(wider[0] - wider[1]) <= SAME_PEAK_PX and abs(sum(wider)) >= 4 * SHIFT_PX
-    if sure and sides.mean(axis=0).max(axis=1).sum() > here:
-        word = "larger" if sum(wider) > 0 else "smaller"
+    sized = np.stack([_sized(edges[k], jumps[k]) for k in some])
+    best, *parts = (int(part.mean(axis=0).argmax()) for part in (sized, sized[::2], sized[1::2]))
+    larger, differ = float(SCALES[best]) - 1.0, abs(float(np.diff(SCALES[parts])[0]))
+    if abs(larger) >= LEAST_SCALE and differ <= SAME_SCALE and sized[:, best].mean() > here:
+        word = f"{100 * abs(larger):.0f} % {'larger' if larger > 0 else 'smaller'}"
         return [f"its colour is {word} than its depth has it: a wrong focal length"]
     x, y = 2 * _peak(each)
     if _is_sure(each) and maps.max() > here and np.hypot(x, y) >= 2 * SHIFT_PX:
@@ -169,12 +168,20 @@ def _jumps_of(depth_m: Float[np.ndarray, "height width"]) -> Int[np.ndarray, "2 
 
 
 def _meeting(edges: np.ndarray, jumps: np.ndarray, shifts_px: np.ndarray) -> np.ndarray:
-    """How strong edges are where depth jumps, left and right of the middle, for each shift."""
+    """How strong edges are where depth jumps, for each shift."""
     (rows, columns), steps = jumps, np.rint(shifts_px).astype(int)
-    right, margin = columns >= edges.shape[1] // 2, int(np.abs(steps).max())
+    margin = int(np.abs(steps).max())
     edges = np.pad(edges, margin, mode="reflect")
-    found = np.array([edges[rows + y + margin, columns + x + margin] for x, y in steps])
-    return np.asarray(np.stack([~right, right]).astype(found.dtype) @ found.T) / max(len(rows), 1)
+    found = [edges[rows + y + margin, columns + x + margin].sum() for x, y in steps]
+    return np.asarray(np.array(found) / max(len(rows), 1))
+
+
+def _sized(edges: np.ndarray, jumps: np.ndarray) -> np.ndarray:
+    """How strong edges are where depth jumps, were it so many times as large."""
+    middle = np.array(edges.shape)[:, None, None] / 2
+    places = middle + SCALES[:, None] * (jumps[:, None] - middle)
+    found = ndimage.map_coordinates(edges, places, order=0, mode="reflect")
+    return np.asarray(found.sum(axis=1) / max(jumps.shape[1], 1))
 
 
 def _blur(views: Sequence[TrainingView]) -> list[str]:
@@ -191,7 +198,7 @@ def _blur(views: Sequence[TrainingView]) -> list[str]:
 
 
 def _sequence(views: Sequence[TrainingView], copies: int) -> list[str]:
-    """Jumps of exposure, and poses that neither neighbour confirms."""
+    """Images sent twice, jumps of exposure, and poses that neither neighbour confirms."""
     steps = [_step(a, b) for a, b in pairwise(views)]
     over = [_step(a, b).agreement for a, b in zip(views, views[2:], strict=False)]
     usual = float(np.median([each.agreement for each in steps]))
@@ -201,10 +208,10 @@ def _sequence(views: Sequence[TrainingView], copies: int) -> list[str]:
         views[k]
         for k in range(1, len(views) - 1)
         if not copies
-        and max(steps[k - 1].agreement, steps[k].agreement) < LOST * usual
+        and max(steps[k - 1].agreement, steps[k].agreement) < min(LOST * usual, over[k - 1] / MORE)
         and over[k - 1] > FITS * usual
     ]
-    told = []
+    told = [f"{copies} of its images are copies of the one before"] if copies else []
     if jumps > 1:
         told.append(
             f"its exposure jumps between {jumps} of {len(steps)} neighbouring images; fix it while "

@@ -83,9 +83,8 @@ class Correction:
         elif self.kind == "focal":
             text = f"its focal length is {1 / self.value:.3g} x the true one"
         else:
-            late = "late" if self.value > 0 else "early"
-            milliseconds = abs(self.value) / 1e6
-            text = f"its poses are {abs(self.frames):.1f} frames {late} ({milliseconds:.0f} ms)"
+            late = f"{'late' if self.value > 0 else 'early'} ({abs(self.value) / 1e6:.0f} ms)"
+            text = f"its poses are {abs(self.frames):.1f} frames {late}"
         return (
             f"{text}: of the depth {100 * self.before:.0f} % agrees to about {100 * SIGMA:.0f} % "
             f"as recorded, {100 * self.after:.0f} % without that"
@@ -107,24 +106,23 @@ def search_geometry(
     recorded = _agreement(pairs)
     if recorded >= ENOUGH:
         return None
-    found = [
-        _best("depth", lambda s: _agreement(pairs, depth=s), recorded, (*FACTORS, *UNITS)),
-        _best("focal", lambda s: _agreement(pairs, focal=s), recorded, tuple(FACTORS)),
-    ]
+    tried: dict[str, tuple[np.ndarray, Callable[[float], float]]] = {
+        "depth": (np.log([*FACTORS, *UNITS]), lambda x: _agreement(pairs, depth=float(np.exp(x)))),
+        "focal": (np.log(FACTORS), lambda x: _agreement(pairs, focal=float(np.exp(x)))),
+    }
     if pose_at is not None and frame_ns > 0:
-        ends_ns = images[0].stamp_ns, images[-1].stamp_ns
-        late = partial(_agreement_late, pairs, pose_at, ends_ns)
-        steps = np.arange(-MOST_LATE_FRAMES, MOST_LATE_FRAMES + 1).astype(np.float64)
-        at, after = _climbed(steps, lambda frames: late(frames * frame_ns))
-        found.append(
-            Correction(kind="delay", value=at * frame_ns, frames=at, before=recorded, after=after)
-        )
-    best = max(found, key=lambda item: item.after)
-    off = abs(best.frames) if best.kind == "delay" else abs(np.log(best.value))
-    is_clear = best.after >= recorded + LEAST_GAIN and best.after >= LEAST_AGREEMENT
-    if best.kind == "depth" and best.value > FACTORS[-1]:
-        is_clear &= best.after >= _agreement(pairs, depth=1e9) + SHIFT_MATTERS
-    return best if is_clear and off >= SMALLEST[best.kind] else None
+        late = partial(_agreement_late, pairs, pose_at, (images[0].stamp_ns, images[-1].stamp_ns))
+        steps = np.arange(-MOST_LATE_FRAMES, MOST_LATE_FRAMES + 1.0)
+        tried["delay"] = steps, lambda frames: late(frames * frame_ns)
+    climbed = {kind: _climbed(*each) for kind, each in tried.items()}
+    kind, (at, after) = max(climbed.items(), key=lambda item: item[1][1])
+    is_clear = after >= recorded + LEAST_GAIN and after >= LEAST_AGREEMENT
+    if kind == "depth" and at > np.log(FACTORS[-1]):
+        is_clear &= after >= _agreement(pairs, depth=1e9) + SHIFT_MATTERS
+    if not is_clear or abs(at) < SMALLEST[kind]:
+        return None
+    value, frames = (at * frame_ns, at) if kind == "delay" else (float(np.exp(at)), 0.0)
+    return Correction(kind=kind, value=value, frames=frames, before=recorded, after=after)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,26 +181,17 @@ def _agreement_late(
     return _agreement(kept) if len(kept) >= LEAST_LEFT * len(pairs) else 0.0
 
 
-def _best(
-    kind: str, score: Callable[[float], float], recorded: float, factors: Sequence[float]
-) -> Correction:
-    at, after = _climbed(np.log(factors), lambda x: score(float(np.exp(x))))
-    return Correction(kind=kind, value=float(np.exp(at)), frames=0.0, before=recorded, after=after)
-
-
 def _climbed(
     grid: Float[np.ndarray, " num_steps"], score: Callable[[float], float]
 ) -> tuple[float, float]:
     """The best place: on a grid first, then with ever smaller steps around the best."""
     scores = [score(float(x)) for x in grid]
     at, best = float(grid[int(np.argmax(scores))]), max(scores)
-    step = float(grid[1] - grid[0]) / 2
-    for _ in range(REFINEMENTS):
+    for step in (float(grid[1] - grid[0]) / 2**k for k in range(1, REFINEMENTS + 1)):
         for x in (at - step, at + step):
             found = score(x)
             if found > best:
                 at, best = x, found
-        step /= 2
     return at, best
 
 
@@ -231,11 +220,7 @@ class WrongGeometryError(TwinError):
 def check_geometry(
     cameras: Sequence[CameraCheck], report: ScanReport, config: FrameConfig
 ) -> ScanReport:
-    """Look for a wrong number in each moving camera; refuse it, or remark on it.
-
-    Raises:
-        WrongGeometryError: When depth agrees much better with another number.
-    """
+    """Look for a wrong number in each moving camera; WrongGeometryError, or a remark."""
     remarks = []
     for camera in cameras:
         choice, poses = camera.choice, report.poses.get(camera.name)

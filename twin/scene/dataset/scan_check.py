@@ -72,7 +72,7 @@ OTHER_POSES = tuple(
 
 GOOD = 0.5
 """With this share of the overlap agreeing, poses and depth belong together."""
-CLEARLY_BETTER = 0.2
+BETTER, CLEARLY_BETTER = 0.12, 0.2
 MIN_OVERLAP = 0.05
 """With less, depth says nothing about the poses."""
 SOLID_OVERLAP = 0.2
@@ -126,7 +126,7 @@ def judged(
     plain: PoseReport, recorded: Meeting, better: Convention, agreement: float
 ) -> PoseReport:
     """The report on poses as recorded, with another reading where that is clearly better."""
-    if agreement < GOOD or agreement < (plain.agreement or 0.0) + CLEARLY_BETTER:
+    if agreement < GOOD or agreement < (plain.agreement or 0.0) + BETTER:
         return plain
     return replace(plain, agreement=recorded.agreement, better=better, better_agreement=agreement)
 

@@ -176,10 +176,9 @@ def _colour_remarks(read: _Read) -> list[str]:
     for index, camera in enumerate(read.cameras):
         episode, pairs = camera.choice.episode, zip(read.views, read.choice_of_view, strict=True)
         mine = sorted((v for v, owner in pairs if owner == index), key=lambda v: v.stamp_ns)
-        if mine and not camera.choice.stationary:
-            inside = range(mine[0].stamp_ns, mine[-1].stamp_ns)  # where poses are known
-            topic = streams.find_camera_topic(episode, camera.choice.camera_id, "color/image")
-            sent = (m for m in episode.messages([topic or ""]) if m.publish_time_ns in inside)
+        if len(mine) > 1 and not camera.choice.stationary:
+            topic = streams.find_camera_topic(episode, camera.choice.camera_id, "color/image") or ""
+            sent = episode.messages([topic], start_ns=mine[1].stamp_ns, end_ns=mine[-1].stamp_ns)
             remarks = check_colour(mine, camera_pose_at(camera.choice), sent)
             found += [f"{camera.name}: {remark}" for remark in remarks]
     return found

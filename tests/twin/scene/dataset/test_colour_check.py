@@ -104,7 +104,7 @@ def test_images_sent_again_are_copies_while_the_camera_moves() -> None:
             lambda: views_of(paint=lambda _: lambda p, f: np.roll(p, 12 // f, axis=2)),
             "lies (+12, +0) pixels beside its depth",
         ),
-        (lambda: views_of(paint=lambda _: enlarged), "its colour is larger than its depth"),
+        (lambda: views_of(paint=lambda _: enlarged), "% larger than its depth"),
         (lambda: views_of(paint=lambda _: lambda p, _: p[:, ::-1, ::-1]), "are upside down"),
         (lambda: views_of(paint=lambda _: lambda p, _: p[:, :, ::-1]), "are mirrored"),
         (
