@@ -97,7 +97,13 @@ def read_training_set(
     if is_measured:
         report = check_scan(read.cameras, config.frames)
         report = check_geometry(read.cameras, report, config.frames)
-        report = replace(report, found=(*report.found, *_colour_remarks(read)))
+        for index, camera in enumerate(read.cameras):
+            if not camera.choice.stationary:
+                owned = zip(read.views, read.choice_of_view, strict=True)
+                mine = sorted((v for v, owner in owned if owner == index), key=lambda v: v.stamp_ns)
+                remarks = check_colour(mine, camera_pose_at(camera.choice))
+                found = (f"{camera.name}: {remark}" for remark in remarks)
+                report = replace(report, found=(*report.found, *found))
     stride = _stride(MAX_POSTURES, read.views[0].full.depth_m.size)
     for choice in choices:
         robot.look_closer(choice, limits_of(config), stride)
@@ -167,18 +173,6 @@ def _read(
                 advance(len(read.views), f"camera {frame.camera_id}")
             read.cameras.append(CameraCheck(choice=choice, images=images, trusted=trusted))
     return read
-
-
-def _colour_remarks(read: _Read) -> list[str]:
-    """What is wrong with the colours of moving cameras."""
-    found = []
-    for index, camera in enumerate(read.cameras):
-        if not camera.choice.stationary:
-            pairs = zip(read.views, read.choice_of_view, strict=True)
-            mine = sorted((v for v, owner in pairs if owner == index), key=lambda v: v.stamp_ns)
-            remarks = check_colour(mine, camera_pose_at(camera.choice))
-            found += [f"{camera.name}: {remark}" for remark in remarks]
-    return found
 
 
 def _set_ego_pixels_aside(
