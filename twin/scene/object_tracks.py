@@ -157,7 +157,10 @@ def _while_near(
     robot: RobotModel | None,
     span_ns: tuple[int, int],
 ) -> _Span:
-    """From when the hand came to where an object lay to when it left where it lies, or the end."""
+    """From when the hand came to where an object lay to when it left where it lies.
+
+    Where it never was there, it left the object, which went on by itself, as long as it would tip.
+    """
     at_end = _rest(span_ns[1], T)
     if after is None or track is None or robot is None:
         return at_end
@@ -167,8 +170,13 @@ def _while_near(
     tool_m = [robot.T_base_tcp(track.at(ns).joints_rad)[:3, 3] for ns in stamps]
     away_m = [np.linalg.norm(tool_m - each[:3, 3], axis=1) for each in (T, after)]
     old, new = (np.flatnonzero(each < reach_m(model)) for each in away_m)
-    pushed = len(old) and len(new) and new[-1] > old[0]
-    return replace(at_end, start_ns=stamps[old[0]], end_ns=stamps[new[-1]]) if pushed else at_end
+    if not len(old):
+        return at_end
+    if len(new) and new[-1] > old[0]:
+        return replace(at_end, start_ns=stamps[old[0]], end_ns=stamps[new[-1]])
+    way_m, left_ns = float(np.linalg.norm(after[:3, 3] - T[:3, 3])), stamps[old[-1]]
+    alone_ns = round(1e9 * TIPS * np.sqrt(2 * way_m / GRAVITY_M_S2))
+    return replace(at_end, start_ns=left_ns, end_ns=left_ns + alone_ns)
 
 
 def _seen(

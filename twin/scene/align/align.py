@@ -264,15 +264,13 @@ def _ranked(candidates: Sequence[_Candidate]) -> tuple[_Candidate, list[_Candida
     least = max(len(item.looked.errors_m) for item in candidates) // 2
     ordered = sorted(candidates, key=lambda item: item.looked.cost_m(least))
     best = ordered[0]
-    others = [item for item in ordered[1:] if _differ(item.pose, best.pose)]
-    return best, others[:1]
-
-
-def _differ(a: ScenePose, b: ScenePose) -> bool:
-    change = se3.invert(a.T_base_source) @ b.T_base_source
-    turn = float(se3.rotation_angle_rad(change[:3, :3]))
-    base = se3.invert(a.T_base_source)[:3, 3] - se3.invert(b.T_base_source)[:3, 3]
-    return turn > APART_RAD / 2 or float(np.linalg.norm(base)) > APART_M / 2
+    own = se3.invert(best.pose.T_base_source)
+    for item in ordered[1:]:
+        T = item.pose.T_base_source
+        turn, base = se3.rotation_angle_rad((own @ T)[:3, :3]), se3.invert(T)[:3, 3] - own[:3, 3]
+        if turn > APART_RAD / 2 or np.linalg.norm(base) > APART_M / 2:
+            return best, [item]
+    return best, []
 
 
 def _accept(best: _Candidate, margin: float | None, num_views: int) -> None:

@@ -95,7 +95,8 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
     Said only where two halves of the views say the same.
     """
     some = spread(np.arange(len(views)), EDGE_VIEWS)
-    edges = [_edges_of(_grey(view.half)) for view in views]
+    slopes = [ndimage.gaussian_gradient_magnitude(_grey(view.half), 1.0) for view in views]
+    edges = [np.minimum(each / max(np.quantile(each, 0.9), 1e-6), 1.0) for each in slopes]
     jumps = [_jumps_of(view.half.depth_m) for view in views]
     each = np.stack([_meeting(edges[k], jumps[k], GRID_PX) for k in some])
     maps = each.mean(axis=0)
@@ -150,12 +151,6 @@ def _flow_px_s(view: TrainingView, pose_at: PoseAt) -> Float[np.ndarray, "2"]:
     front = later[:, 2] > 0.05
     moved = target.camera.project(later[front])[0] - target.camera.project(p[front])[0]
     return np.median(moved, axis=0) / (2e-9 * STEP_NS) if front.any() else np.zeros(2)
-
-
-def _edges_of(grey: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """How strong an image's edges are, up to 1."""
-    edges = ndimage.gaussian_gradient_magnitude(grey, 1.0)
-    return np.asarray(np.minimum(edges / max(float(np.quantile(edges, 0.9)), 1e-6), 1.0))
 
 
 def _jumps_of(depth_m: Float[np.ndarray, "height width"]) -> Int[np.ndarray, "2 num_jumps"]:

@@ -127,7 +127,14 @@ def rooted_in_base(transforms: Sequence[FrameTransform], base_frame: str) -> lis
     while frame in parents and frame not in above:
         above.append(frame)
         frame = parents[frame]
-    if not above or not all(_stands(transforms, child) for child in above):
+    first = {item.child: item for item in reversed(transforms)}
+    stands = all(  # each has always the same place in the same parent
+        item.parent == first[item.child].parent
+        and np.allclose(item.T_parent_child, first[item.child].T_parent_child, rtol=0.0, atol=SAME)
+        for item in transforms
+        if item.child in above
+    )
+    if not above or not stands:
         return list(transforms)
     return [
         FrameTransform(
@@ -140,17 +147,6 @@ def rooted_in_base(transforms: Sequence[FrameTransform], base_frame: str) -> lis
         else item
         for item in transforms
     ]
-
-
-def _stands(transforms: Sequence[FrameTransform], child: str) -> bool:
-    """Whether one frame always has the same place in the same parent."""
-    own = [item for item in transforms if item.child == child]
-    first = own[0]
-    return all(
-        item.parent == first.parent
-        and np.allclose(item.T_parent_child, first.T_parent_child, rtol=0.0, atol=SAME)
-        for item in own
-    )
 
 
 ODOMETRY_FRAME = "odometry"

@@ -47,26 +47,22 @@ def check_camera(episode: Episode, camera_id: str) -> None:
     for stream in ("color", "depth") if has_depth(episode, camera_id) else ("color",):
         try:
             camera = streams.camera_info(episode, camera_id, stream).camera
-            size = _first_size(episode, camera_id, stream)
+            topic = streams.find_camera_topic(episode, camera_id, f"{stream}/image")
+            first = next(iter(episode.messages([topic])), None) if topic else None
+            if first is None:
+                continue
+            if stream == "color":
+                image = color_from_message(first.type_name, first.data).image_u8()
+            else:
+                image = DepthImage.from_message(first.type_name, first.data).depth_mm
         except BridgeError as error:
             message = f"{name_of(episode, camera_id)} cannot be used: {error}"
             raise UnusableCameraError(message) from error
-        if size is not None and size != (camera.width, camera.height):
+        height, width = image.shape[:2]
+        if (width, height) != (camera.width, camera.height):
             message = (
-                f"{name_of(episode, camera_id)} sends {stream} images of {size[0]} x {size[1]} "
+                f"{name_of(episode, camera_id)} sends {stream} images of {width} x {height} "
                 f"pixels, and {stream}/info is for {camera.width} x {camera.height}. Record it "
                 "again with the intrinsics of the images that are sent."
             )
             raise UnusableCameraError(message)
-
-
-def _first_size(episode: Episode, camera_id: str, stream: str) -> tuple[int, int] | None:
-    """Width and height of the first image; None without any."""
-    topic = streams.find_camera_topic(episode, camera_id, f"{stream}/image")
-    for message in episode.messages([topic] if topic else []):
-        if stream == "color":
-            height, width = color_from_message(message.type_name, message.data).image_u8().shape[:2]
-        else:
-            height, width = DepthImage.from_message(message.type_name, message.data).depth_mm.shape
-        return width, height
-    return None

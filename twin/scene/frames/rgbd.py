@@ -271,11 +271,17 @@ def training_view(surface: FrameSurface) -> TrainingView:
     width, height = (side + side % 2 for side in frame.image_u8.shape[1::-1])
     half = replace(frame.color_camera, width=width, height=height).scaled(0.5)  # whole blocks
     total = _blocks(frame.image_u8, half).sum(axis=(1, 3), dtype=np.uint16)
+    # Of each block the mean of its nearest surface; blocks without a measurement stay 0.
+    known = _blocks(np.where(depth_m > 0, depth_m, np.float32(np.inf)), half)
+    nearest = known.min(axis=(1, 3), keepdims=True)
+    same = (known <= np.float32(SAME_SURFACE) * nearest) & np.isfinite(known)
+    sums = np.where(same, known, np.float32(0.0)).sum(axis=(1, 3))
+    half_m = as_float32(sums / np.maximum(same.sum(axis=(1, 3)), 1))
     return TrainingView(
         camera_id=frame.camera_id,
         stamp_ns=frame.stamp_ns,
         T_base_color=frame.T_base_color,
-        half=_target(half, (total + 2) // 4, _halved_depth(depth_m, half)),
+        half=_target(half, (total + 2) // 4, half_m),
         full=_target(frame.color_camera, frame.image_u8, depth_m),
     )
 
@@ -293,12 +299,3 @@ def _blocks(rows: np.ndarray, camera: Camera) -> np.ndarray:
     padded = np.pad(rows, missing + ((0, 0),) * (rows.ndim - 2), mode="edge")
     shape = (camera.height, 2, camera.width, 2, *rows.shape[2:])
     return np.asarray(padded.reshape(shape))
-
-
-def _halved_depth(depth_m: np.ndarray, camera: Camera) -> np.ndarray:
-    """Mean of each block's measurements of its nearest surface; blocks without one stay 0."""
-    known = _blocks(np.where(depth_m > 0, depth_m, np.float32(np.inf)), camera)
-    nearest = known.min(axis=(1, 3), keepdims=True)
-    same = (known <= np.float32(SAME_SURFACE) * nearest) & np.isfinite(known)
-    total = np.where(same, known, np.float32(0.0)).sum(axis=(1, 3))
-    return as_float32(total / np.maximum(same.sum(axis=(1, 3)), 1))

@@ -39,7 +39,7 @@ MOVED = "moved"
 """In the settings of a localisation: cameras that were found to have moved since the scan."""
 STILL_FRAMES = 3
 """Of each camera, for that."""
-LOCALISE_VERSION = 5
+LOCALISE_VERSION = 6
 """Counts changes of method that make older localisations out of date."""
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import median_filter
 from scipy.signal import find_peaks, peak_widths
 
 from bridge.episode import streams
@@ -41,7 +42,12 @@ PLATEAU_M = 0.003
 OPENS_M = 0.0005
 """Fingers that go this far from where they held a thing have let it go."""
 EMPTY_M = 0.002
-"""Fingers that close to less have nothing between them."""
+"""Fingers that close to less have nothing between them, or nothing any more: as good as open."""
+SNAP, SNAPS = 5, 0.1
+"""Samples of which the median counts, and share of a grasp in which fingers may be nearer than they
+held a thing: they snap shut when it slips out."""
+STOOD = 1 / 3
+"""Fingers that stood there for a smaller share of the time closed, or opened, on nothing."""
 CLOSES = 0.25
 """Of the farthest way of the fingers: less is not a grip."""
 SETTLES = 0.25
@@ -89,14 +95,15 @@ def grips_between(track: PostureTrack, robot: RobotModel, start_ns: int, end_ns:
     stamps, width_m = widths.stamps_ns[inside], widths.position[inside, 0]
     if len(stamps) == 0 or np.ptp(width_m) < PLATEAU_M:
         return []
+    width_m = median_filter(np.where(width_m < EMPTY_M, width_m.max(), width_m), SNAP)
     closed_m = -np.pad(width_m, 1, constant_values=width_m.max())
     deepest, _ = find_peaks(closed_m, prominence=CLOSES * np.ptp(width_m))
     _, _, began, ended = peak_widths(closed_m, deepest)  # half way, whatever other grips hold
     grips = []
     for first, last in zip(np.ceil(began).astype(int) - 1, ended.astype(int), strict=True):
-        least_m = float(width_m[first:last].min())
-        held = first + np.flatnonzero(width_m[first:last] <= least_m + PLATEAU_M)
-        if least_m < EMPTY_M:
+        grasp_m = np.quantile(width_m[first:last], SNAPS)
+        held = first + np.flatnonzero(np.abs(width_m[first:last] - grasp_m) <= PLATEAU_M)
+        if len(held) < STOOD * (last - first):
             continue
         late = held[-1 - len(held) // 4 :]
         opens_m = np.median(width_m[late]) + OPENS_M

@@ -332,17 +332,14 @@ def read_objects(
     objects = {}
     for key in record.get("objects", {}) if wanted is None else wanted:
         folder = objects_folder(run) / check_episode_id(key)
-        has_sdf = SDF in record["objects"][key].get("files", {})
+        has_sdf, path = SDF in record["objects"][key].get("files", {}), folder / "object.json"
+        try:
+            T = se3.pose_from_record(json.loads(path.read_text())["T_base_object"])
+        except (OSError, ValueError, KeyError, TypeError, InvalidRecordError) as error:
+            raise UnreadableSceneError(path=path, found=f"no pose ({error})") from error
         objects[key] = ObjectSplats(
             cloud=read_ply(folder / "gaussians.ply"),
-            T_base_object=_read_pose(folder / "object.json"),
+            T_base_object=T,
             sdf=SdfGrid.load(folder / SDF) if has_sdf else None,
         )
     return objects
-
-
-def _read_pose(path: Path) -> Float[np.ndarray, "4 4"]:
-    try:
-        return se3.pose_from_record(json.loads(path.read_text())["T_base_object"])
-    except (OSError, ValueError, KeyError, TypeError, InvalidRecordError) as error:
-        raise UnreadableSceneError(path=path, found=f"no pose ({error})") from error

@@ -154,7 +154,17 @@ def find_placements(sources: Sources, choices: Sequence[FrameChoice], output: Ou
     placed: dict[Path, Placement] = {}
     try:
         for episode, file in tasks.files:
-            placed[episode.path] = _placement(episode, file.task(), choices, output)
+            own_task = file.task()
+            names = ", ".join(own_task.objects)
+            output.say(f"look for {names} in {episode.info.id} and take them out")
+            own = [choice for choice in choices if choice.episode.path == episode.path]
+            localised = localise_episode(
+                episode,
+                own_task,
+                held_out_ns={choice.camera_id: choice.holdout_ns for choice in own},
+                poses={c.camera_id: c.poses for c in own if c.poses.source == "hand-eye"},
+            )
+            placed[episode.path] = Placement(episode=episode, task=own_task, localised=localised)
     except GstError as error:
         return Placements(by_episode={}, remark=f"objects not taken out: {error}")
     found = {key for item in placed.values() for key in item.poses}
@@ -166,18 +176,3 @@ def find_placements(sources: Sources, choices: Sequence[FrameChoice], output: Ou
     }
     remark = "; ".join([*tasks.missing, *reasons.values()])
     return Placements(task=task, by_episode=placed, remark=remark)
-
-
-def _placement(
-    episode: Episode, task: Task, choices: Sequence[FrameChoice], output: Output
-) -> Placement:
-    """Look for a task's objects in the frames of one episode that are not held out."""
-    output.say(f"look for {', '.join(task.objects)} in {episode.info.id} and take them out")
-    own = [choice for choice in choices if choice.episode.path == episode.path]
-    localised = localise_episode(
-        episode,
-        task,
-        held_out_ns={choice.camera_id: choice.holdout_ns for choice in own},
-        poses={c.camera_id: c.poses for c in own if c.poses.source == "hand-eye"},
-    )
-    return Placement(episode=episode, task=task, localised=localised)

@@ -102,7 +102,12 @@ class Sight:
 
 def look(box: VoxelBox, view: MaskedView) -> Sight:
     """Project all voxel centres into a view and compare depths."""
-    x, y, z = _in_camera(box, se3.invert(view.T_base_camera))
+    rows = []  # of camera coordinates: sums of three instead of a matrix product
+    for row in se3.invert(view.T_base_camera)[:3].astype(np.float64):
+        along = [(row[axis] * box.axis_m(axis)).astype(np.float32) for axis in range(3)]
+        along[2] = along[2] + np.float32(row[3])
+        rows.append(along[0][:, None, None] + along[1][:, None] + along[2])
+    x, y, z = rows
     camera = view.camera
     inverse = 1.0 / np.maximum(z, np.float32(NEAR_M))
     u = np.float32(camera.fx) * x * inverse + np.float32(camera.cx)
@@ -152,19 +157,6 @@ def _between_pixels(
     one = (lowest > 0) & (highest - lowest < ONE_SURFACE_M)
     between = (a * (1 - x) + b * x) * (1 - y) + (c * (1 - x) + d * x) * y
     return np.where(one, between, nearest_m)
-
-
-def _in_camera(
-    box: VoxelBox, T_camera_base: Float[np.ndarray, "4 4"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Camera coordinates of all centres; sums of three rows instead of a matrix product."""
-    T = T_camera_base.astype(np.float64)
-    rows = []
-    for row in T[:3]:
-        along = [(row[axis] * box.axis_m(axis)).astype(np.float32) for axis in range(3)]
-        along[2] = along[2] + np.float32(row[3])
-        rows.append(along[0][:, None, None] + along[1][:, None] + along[2])
-    return rows[0], rows[1], rows[2]
 
 
 FREE_TRUNCATIONS = 0.6

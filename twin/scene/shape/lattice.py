@@ -1,7 +1,6 @@
 """Tetrahedra inside a reconstructed shape, for soft bodies."""
 
 import numpy as np
-from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -35,7 +34,12 @@ def lattice(shape: SdfGrid) -> dict[str, np.ndarray]:
         filled = fill(shape.distance, low, high, SPACING_M)
     except UsageError as error:
         raise ShapeError(message) from error
-    nodes, tets = _largest_piece(filled.points_m, filled.tetrahedra)
+    nodes, tets = filled.points_m, filled.tetrahedra
+    links = (np.ones(3 * len(tets)), (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()))
+    _, piece = connected_components(coo_array(links, shape=(len(nodes), len(nodes))))
+    kept = tets[piece[tets[:, 0]] == np.bincount(piece).argmax()]
+    used, index = np.unique(kept, return_inverse=True)
+    nodes, tets = nodes[used], index.reshape(-1, 4)
     shares = np.zeros(len(nodes))
     np.add.at(shares, tets, np.abs(volumes_m3(nodes, tets))[:, None] / 4)
     return {
@@ -44,13 +48,3 @@ def lattice(shape: SdfGrid) -> dict[str, np.ndarray]:
         "mass_fraction": (shares / shares.sum()).astype(np.float32),
         "spacing_m": np.array(SPACING_M),
     }
-
-
-def _largest_piece(
-    nodes_m: Float[np.ndarray, "num_nodes 3"], tets: Int[np.ndarray, "num_tets 4"]
-) -> tuple[Float[np.ndarray, "num_kept 3"], Int[np.ndarray, "num_kept_tets 4"]]:
-    links = (np.ones(3 * len(tets)), (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()))
-    _, piece = connected_components(coo_array(links, shape=(len(nodes_m), len(nodes_m))))
-    kept = tets[piece[tets[:, 0]] == np.bincount(piece).argmax()]
-    used, index = np.unique(kept, return_inverse=True)
-    return nodes_m[used], index.reshape(-1, 4)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 
 from bridge.episode.run_folder import RunFolder
 from bridge.episode.streams import RgbdFrame
@@ -49,14 +50,7 @@ def heaps() -> tuple[GaussianCloud, np.ndarray]:
     means = np.concatenate([flat, red, blue])
     colors = np.array([(0.5, 0.5, 0.5), COLOURS[1], COLOURS[2]])[labels]
     sigma = np.where(labels == 0, 0.015, 0.008)
-    cloud = GaussianCloud(
-        means_m=as_float32(means),
-        quats_wxyz=as_float32(np.tile([1.0, 0, 0, 0], (len(means), 1))),
-        scales_log=as_float32(np.log(np.repeat(sigma[:, None], 3, axis=1))),
-        opacities_logit=as_float32(np.full(len(means), 4.0)),
-        colors=as_float32(colors),
-    )
-    return cloud, labels
+    return even_cloud(means, colors, sigma[:, None]), labels
 
 
 def things(labels: np.ndarray) -> SemanticScene:

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clouds import any_cloud
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
@@ -21,14 +22,7 @@ from twin.scene.harmonics import NUM_FIRST, harmonic_terms, turned_harmonics
 
 
 def plain_cloud(count: int = 30) -> GaussianCloud:
-    rng = np.random.default_rng(4)
-    return GaussianCloud(
-        means_m=as_float32(rng.uniform([-0.4, -0.3, 0.6], [0.4, 0.3, 1.5], size=(count, 3))),
-        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
-        scales_log=as_float32(np.log(rng.uniform(0.02, 0.08, size=(count, 3)))),
-        opacities_logit=as_float32(rng.normal(size=count)),
-        colors=as_float32(rng.uniform(size=(count, 3))),
-    )
+    return any_cloud(4, count, [[-0.4, -0.3, 0.6], [0.4, 0.3, 1.5]], (0.02, 0.08))
 
 
 def shiny_cloud(count: int = 30) -> GaussianCloud:

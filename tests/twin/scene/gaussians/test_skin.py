@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from clouds import any_cloud
 from seen_colors import effective_colors
 
 from bridge.geometry import se3
@@ -17,17 +18,8 @@ def nodes() -> np.ndarray:
 
 @pytest.fixture
 def cloud(nodes: np.ndarray) -> GaussianCloud:
-    rng = np.random.default_rng(3)
-    count = 300
-    means = rng.uniform(nodes.min(axis=0) - 0.005, nodes.max(axis=0) + 0.005, (count, 3))
-    return GaussianCloud(
-        means_m=means.astype(np.float32),
-        quats_wxyz=rng.normal(size=(count, 4)).astype(np.float32),
-        scales_log=rng.normal(-6, 0.3, (count, 3)).astype(np.float32),
-        opacities_logit=rng.normal(size=count).astype(np.float32),
-        colors=rng.uniform(size=(count, 3)).astype(np.float32),
-        harmonics=rng.normal(0, 0.1, (count, 3, 3)).astype(np.float32),
-    )
+    box = [nodes.min(axis=0) - 0.005, nodes.max(axis=0) + 0.005]
+    return any_cloud(3, 300, box, (0.002, 0.003), harmonics=3)
 
 
 def covariances(cloud: GaussianCloud) -> np.ndarray:

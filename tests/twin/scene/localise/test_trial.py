@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.reader import Episode
@@ -15,7 +16,7 @@ from bridge.episode.writer import EpisodeWriter
 from bridge.geometry.camera import Camera
 from bridge.task.task_file import Task, load_task
 from twin.scene import trial
-from twin.scene.gaussians import GaussianCloud, as_float32, write_ply
+from twin.scene.gaussians import write_ply
 from twin.scene.raster.rasteriser import Rasteriser
 from twin.scene.render import part_masks
 from twin.scene.shape.known import pose_of, shape_mesh
@@ -30,17 +31,6 @@ CAMERA = Camera(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
 EYES = (("side", (1.1, -0.4, 0.6), (0.45, 0.0, 0.0)), ("wrist", (0.3, 0.0, 0.6), (0.5, 0.02, 0.0)))
 
 
-def cloud_of(points: np.ndarray, color: tuple[float, float, float]) -> GaussianCloud:
-    count = len(points)
-    return GaussianCloud(
-        means_m=as_float32(points),
-        quats_wxyz=as_float32(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))),
-        scales_log=as_float32(np.full((count, 3), np.log(0.004))),
-        opacities_logit=as_float32(np.full(count, 4.0)),
-        colors=as_float32(np.tile(color, (count, 1))),
-    )
-
-
 @pytest.fixture
 def on_block() -> Task:
     return load_task("cube_on_block")
@@ -53,12 +43,12 @@ def run(tmp_path: Path) -> RunFolder:
     run.scene_dir.mkdir()
     grid = np.stack(np.meshgrid(np.arange(0.2, 0.8, 0.006), np.arange(-0.3, 0.3, 0.006)), -1)
     table = np.column_stack([grid.reshape(-1, 2), np.zeros(grid[..., 0].size)])
-    write_ply(run.scene_dir / "background.ply", cloud_of(table, (0.6, 0.55, 0.5)))
+    write_ply(run.scene_dir / "background.ply", even_cloud(table, (0.6, 0.55, 0.5), 0.004))
     for name in ("cube", "box"):
         place = run.scene_dir / "objects" / name
         place.mkdir(parents=True)
         corners = np.random.default_rng(0).uniform(-0.02, 0.02, (300, 3))
-        write_ply(place / "gaussians.ply", cloud_of(corners, (0.8, 0.2, 0.2)))
+        write_ply(place / "gaussians.ply", even_cloud(corners, (0.8, 0.2, 0.2), 0.004))
         pose = {"p_m": [0.5, 0.2, 0.02], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
         (place / "object.json").write_text(json.dumps({"T_base_object": pose}))
     scanned: dict[str, Any] = {"cube": {}, "box": {}}

@@ -9,6 +9,7 @@ import cast_views
 import numpy as np
 import open3d as o3d
 import pytest
+from clouds import even_cloud
 
 from bridge.episode.metadata import EpisodeInfo
 from bridge.episode.provenance import hash_file
@@ -20,7 +21,7 @@ from bridge.geometry.camera import Camera
 from bridge.task.task_file import Task, load_task
 from bridge.terminal import Output
 from twin.scene.frames.rgbd import PointSet, Target, TrainingView
-from twin.scene.gaussians import GaussianCloud, as_float32, read_ply
+from twin.scene.gaussians import as_float32, read_ply
 from twin.scene.localise.result import LocalisedObject
 from twin.scene.objects.decompose import Decomposition, decompose, fill_footprint
 from twin.scene.objects.placement import Placement, Placements
@@ -29,6 +30,7 @@ from twin.scene.shape.known import pose_of, shape_mesh
 QUIET = Output(quiet=True)
 INTO_BOX, ON_BLOCK = load_task("cube_into_box"), load_task("cube_on_block")
 FULL = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
+GREY = np.array((150, 140, 128)) / 255
 HALF = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=80.0, cy=60.0)
 SCANS = {
     "scan_1": (
@@ -60,17 +62,6 @@ def episode_named(folder: Path, name: str) -> Episode:
 def episodes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Episode]:
     folder = tmp_path_factory.mktemp("episodes")
     return {name: episode_named(folder, name) for name in (*SCANS, "scan_9")}
-
-
-def cloud_of(points: np.ndarray, color: tuple[int, int, int]) -> GaussianCloud:
-    count = len(points)
-    return GaussianCloud(
-        means_m=as_float32(points),
-        quats_wxyz=as_float32(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))),
-        scales_log=as_float32(np.full((count, 3), np.log(0.002))),
-        opacities_logit=as_float32(np.full(count, 2.0)),
-        colors=as_float32(np.tile(np.array(color) / 255, (count, 1))),
-    )
 
 
 def target_of(meshes: dict[str, Any], colors: np.ndarray, T: np.ndarray, camera: Camera) -> Target:
@@ -140,7 +131,7 @@ def parts(placements: Placements, views: dict[str, list[TrainingView]]) -> Decom
     table[0] = SCANS["scan_1"][1]["cube"][:3, 3] + [0.0, 0.0, 0.025]  # left over above the cube
     return decompose(
         placements,
-        cloud_of(table, (150, 140, 128)),
+        even_cloud(table, GREY, logit=2.0),
         lambda episode: views[episode.path.stem],
         QUIET,
     )
@@ -237,12 +228,12 @@ def test_the_hole_under_an_object_is_filled_with_the_table_around_and_only_there
     half = np.array(model.size_m[:2]) / 2
     under = se3.apply(se3.invert(T), np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
     seen = np.any(np.abs(under) > half, axis=1)
-    table = cloud_of(np.column_stack([xy[seen], np.full(seen.sum(), 0.001)]), (150, 140, 128))
+    table = even_cloud(np.column_stack([xy[seen], np.full(seen.sum(), 0.001)]), GREY, logit=2.0)
     filling = fill_footprint(table, model, T)
     assert len(filling) == pytest.approx(0.04**2 / 0.004**2, rel=0.3)
     local = se3.apply(se3.invert(T), filling.means_m.astype(np.float64))
     assert np.all(np.abs(local[:, :2]) < half + 0.001)
     np.testing.assert_allclose(filling.means_m[:, 2], 0.001, atol=1e-6)
     np.testing.assert_allclose(filling.colors - table.colors[0], 0.0, atol=1e-6)
-    whole = cloud_of(np.column_stack([xy, np.zeros(len(xy))]), (150, 140, 128))
+    whole = even_cloud(np.column_stack([xy, np.zeros(len(xy))]), GREY, logit=2.0)
     assert len(fill_footprint(whole, model, T)) == 0

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from clouds import any_cloud, even_cloud
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_pull import pull_back
@@ -15,15 +16,8 @@ CAMERA = Camera(width=50, height=35, fx=60.0, fy=60.0, cx=25.0, cy=17.5)
 
 
 def shiny_cloud(count: int, seed: int = 0) -> GaussianCloud:
-    rng = np.random.default_rng(seed)
-    return GaussianCloud(
-        means_m=as_float32(rng.uniform([-0.6, -0.5, 0.4], [0.6, 0.5, 3.0], size=(count, 3))),
-        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
-        scales_log=as_float32(np.log(rng.uniform(0.002, 0.08, size=(count, 3)))),
-        opacities_logit=as_float32(rng.normal(1.0, 2.0, size=count)),
-        colors=as_float32(rng.uniform(size=(count, 3))),
-        harmonics=as_float32(rng.normal(scale=0.2, size=(count, 3, 3))),
-    )
+    box, shine = [[-0.6, -0.5, 0.4], [0.6, 0.5, 3.0]], {"harmonics": 3, "shine": 0.2}
+    return any_cloud(seed, count, box, (0.002, 0.08), mean=1.0, spread=2.0, **shine)
 
 
 def drawn(cloud: GaussianCloud, config: RasterConfig) -> Rasteriser:
@@ -117,13 +111,7 @@ def test_a_gaussian_on_a_tile_edge_is_whole(edge: int, offset: float) -> None:
 
     def alpha_sum(x_px: float) -> float:
         x = (x_px - CAMERA.cx) / CAMERA.fx
-        cloud = GaussianCloud(
-            means_m=as_float32(np.array([[x, 0.0, 1.0]])),
-            quats_wxyz=as_float32(np.array([[1.0, 0.0, 0.0, 0.0]])),
-            scales_log=np.full((1, 3), np.log(0.02), dtype=np.float32),
-            opacities_logit=np.zeros(1, dtype=np.float32),
-            colors=np.ones((1, 3), dtype=np.float32),
-        )
+        cloud = even_cloud(np.array([[x, 0.0, 1.0]]), 1.0, 0.02, logit=0.0)
         wide = Camera(width=120, height=35, fx=60.0, fy=60.0, cx=25.0 + 40, cy=17.5)
         rasteriser = Rasteriser(RasterConfig(threads=1, alpha_cut=1e-4))
         return float(rasteriser.draw_planes(cloud, wide, np.eye(4))[4].sum())

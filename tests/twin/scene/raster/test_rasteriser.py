@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from clouds import any_cloud, even_cloud
 from splat_pull import pull_back
 
 from bridge.geometry.camera import Camera
@@ -23,24 +24,11 @@ def one_gaussian(
 ) -> GaussianCloud:
     """A round Gaussian whose centre projects to one place of the image."""
     mean = [(x_px - CAMERA.cx) / CAMERA.fx * depth_m, (y_px - CAMERA.cy) / CAMERA.fy * depth_m]
-    return GaussianCloud(
-        means_m=as_float32(np.array([[*mean, depth_m]])),
-        quats_wxyz=as_float32(np.array([[1.0, 0.0, 0.0, 0.0]])),
-        scales_log=np.full((1, 3), np.log(sigma_m), dtype=np.float32),
-        opacities_logit=np.full(1, opacity_logit, dtype=np.float32),
-        colors=as_float32(np.array([[0.2, 0.5, 0.9]])),
-    )
+    return even_cloud(np.array([[*mean, depth_m]]), [0.2, 0.5, 0.9], sigma_m, opacity_logit)
 
 
 def many_gaussians(count: int = 3000, seed: int = 7) -> GaussianCloud:
-    rng = np.random.default_rng(seed)
-    return GaussianCloud(
-        means_m=as_float32(rng.uniform([-0.5, -0.4, 0.5], [0.5, 0.4, 3.0], size=(count, 3))),
-        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
-        scales_log=as_float32(np.log(rng.uniform(0.002, 0.05, size=(count, 3)))),
-        opacities_logit=as_float32(rng.normal(size=count)),
-        colors=as_float32(rng.uniform(size=(count, 3))),
-    )
+    return any_cloud(seed, count, [[-0.5, -0.4, 0.5], [0.5, 0.4, 3.0]], (0.002, 0.05))
 
 
 def draw(cloud: GaussianCloud, config: RasterConfig | None = None) -> np.ndarray:

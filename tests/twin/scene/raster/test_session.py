@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from clouds import any_cloud
 from reference_loss import Loss
 from splat_pull import gradient_of, pull_back
 
@@ -33,15 +34,8 @@ MIXED = np.array([[0.9, 0.1, -0.05, 0.02], [-0.08, 1.05, 0.03, -0.03], [0.02, -0
 
 
 def some_cloud(count: int = 400, num_harmonics: int = 3) -> GaussianCloud:
-    rng = np.random.default_rng(1)
-    return GaussianCloud(
-        means_m=as_float32(rng.uniform([-0.5, -0.7, 0.8], [0.5, 0.7, 2.0], size=(count, 3))),
-        quats_wxyz=as_float32(rng.normal(size=(count, 4))),
-        scales_log=as_float32(np.log(rng.uniform(0.02, 0.1, size=(count, 3)))),
-        opacities_logit=as_float32(rng.normal(size=count)),
-        colors=as_float32(rng.uniform(size=(count, 3))),
-        harmonics=as_float32(rng.normal(scale=0.1, size=(count, num_harmonics, 3))),
-    )
+    box = [[-0.5, -0.7, 0.8], [0.5, 0.7, 2.0]]
+    return any_cloud(1, count, box, (0.02, 0.1), harmonics=num_harmonics)
 
 
 def some_target(*, masked: bool = True) -> Target:

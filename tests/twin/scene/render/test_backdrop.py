@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clouds import even_cloud
 
 from bridge.episode.run_folder import RunFolder
 from bridge.geometry import se3
@@ -13,7 +14,6 @@ from bridge.media.color import decode_color
 from twin.errors import UnreadableFileError
 from twin.scene import backdrop
 from twin.scene.frames.rgbd import Target, TrainingView
-from twin.scene.gaussians import GaussianCloud
 from twin.scene.raster.rasteriser import RasterConfig, Rasteriser, View
 from twin.scene.render import render
 from twin.scene.settings import RenderConfig
@@ -101,19 +101,11 @@ def seen_views(headings: tuple[float, ...]) -> list[TrainingView]:
     return views
 
 
-def empty_cloud() -> GaussianCloud:
-    return GaussianCloud(
-        means_m=np.zeros((0, 3), np.float32),
-        quats_wxyz=np.zeros((0, 4), np.float32),
-        scales_log=np.zeros((0, 3), np.float32),
-        opacities_logit=np.zeros(0, np.float32),
-        colors=np.zeros((0, 3), np.float32),
-    )
-
-
 def test_the_shell_shows_what_views_saw_and_goes_on_smoothly_where_none_looked() -> None:
     views = seen_views((-3.0, -2.2, -1.4))
-    made = backdrop.backdrop_of(empty_cloud(), views, Rasteriser(RasterConfig(threads=1)))
+    made = backdrop.backdrop_of(
+        even_cloud(np.zeros((0, 3)), 0.0), views, Rasteriser(RasterConfig(threads=1))
+    )
     black = replace(nothing(), image=np.zeros((48, 64, 3), np.float32))
     for view in views:
         drawn = made.behind(black, CAMERA, view.T_base_color).image
@@ -185,7 +177,7 @@ def test_pixels_that_moved_say_nothing() -> None:
     static[:, :32] = False
     target = replace(view.half, planes_u8=masked, static_mask=static)
     made = backdrop.backdrop_of(
-        empty_cloud(),
+        even_cloud(np.zeros((0, 3)), 0.0),
         [replace(view, half=target, full=target)],
         Rasteriser(RasterConfig(threads=1)),
     )

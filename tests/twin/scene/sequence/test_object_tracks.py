@@ -101,18 +101,42 @@ def test_a_cube_that_looks_the_same_after_a_quarter_turn_does_not_spin_in_the_ha
     np.testing.assert_allclose(poses["cube"], T_tcp(5, track) @ IN_HAND, atol=1e-9)
 
 
-def test_what_is_pushed_moves_while_the_hand_is_near() -> None:
-    """The hand stands over it until 3.5 s, in the execution from 1 s on, and turns away then."""
+@pytest.mark.parametrize("way_m", [0.02, 0.5])
+def test_what_is_pushed_moves_while_the_hand_is_near(way_m: float) -> None:
+    """The hand is there until 3.5 s, in the execution from 1 s on, and turns away."""
     track = posture_track(0.0005)
     before = T_tcp(3, track) @ IN_HAND
     after = before.copy()
-    after[0, 3] += 0.02
+    after[0, 3] += way_m
     found = tracks(before, after, track)
-    assert found.notes == ("cube was moved by 2 cm without being held: drawn there afterwards",)
+    way = f"{100 * way_m:.0f} cm"
+    assert found.notes == (f"cube was moved by {way} without being held: drawn there afterwards",)
     x = [found.at(round(t * S), T_tcp(t, track))["cube"][0, 3] - before[0, 3] for t in range(10)]
     np.testing.assert_allclose(x[:2], 0.0, atol=1e-9)
-    assert 0.002 < x[2] < x[3] < 0.018
-    np.testing.assert_allclose(x[5:], 0.02, atol=1e-9)
+    if way_m < 0.1:
+        assert 0.1 * way_m < x[2] < x[3] < 0.9 * way_m
+    else:  # it was never there
+        np.testing.assert_allclose(x[2:4], 0.0, atol=1e-9)
+    np.testing.assert_allclose(x[5 if way_m < 0.1 else 6 :], way_m, atol=1e-9)
+    assert (np.diff(x) >= 0.0).all()
+
+
+@pytest.mark.parametrize("stood", [True, False])
+def test_what_slips_out_of_the_hand_falls_from_there(stood: bool) -> None:
+    """At 5 s; fingers that closed as far without a stop had nothing between them."""
+    track = posture_track()
+    assert track.widths is not None
+    t_s = track.widths.stamps_ns / S
+    shut_m = np.interp(t_s, [3.0, 5.0], [0.085, 0.0])
+    width_m = np.where(t_s < 5, track.widths.position[:, 0] if stood else shut_m, 0.0)
+    track = replace(track, widths=replace(track.widths, position=width_m[:, None]))
+    before, after = T_tcp(3, track) @ IN_HAND, T_tcp(5, track) @ IN_HAND
+    after[2, 3] -= 0.2
+    found = tracks(before, after, track)
+    assert ("where it was let go" if stood else "without being held") in found.notes[0]
+    held, lies = (found.at(round(t * S), T_tcp(t, track))["cube"] for t in (4.8, 5.4))
+    assert np.allclose(held, T_tcp(4.8, track) @ IN_HAND, atol=1e-6) == stood
+    np.testing.assert_allclose(lies, after, atol=1e-9)
 
 
 def tipping_s(edge_m: float) -> float:

@@ -6,12 +6,12 @@ from pathlib import Path
 import cast_views
 import numpy as np
 import pytest
+from clouds import even_cloud
 
 from bridge.geometry import se3
 from bridge.task.meshes.solids import is_closed
 from bridge.task.task_file import load_task
 from twin.scene.frames.rgbd import TrainingView
-from twin.scene.gaussians import GaussianCloud, as_float32
 from twin.scene.objects.decompose import LibraryObject, ObjectSplats
 from twin.scene.shape.from_training import masked_view, shapes_of
 from twin.scene.shape.known import pose_of
@@ -56,13 +56,7 @@ def test_what_cannot_be_reconstructed_says_why(views: list[TrainingView]) -> Non
 
 
 def library_object(key: str, shape: ObjectShape | str) -> LibraryObject:
-    cloud = GaussianCloud(
-        means_m=as_float32(np.zeros((3, 3))),
-        quats_wxyz=as_float32(np.tile([1.0, 0, 0, 0], (3, 1))),
-        scales_log=as_float32(np.full((3, 3), -6.0)),
-        opacities_logit=as_float32(np.ones(3)),
-        colors=as_float32(np.ones((3, 3))),
-    )
+    cloud = even_cloud(np.zeros((3, 3)), 1.0)
     return LibraryObject(
         model=TASK.objects[key],
         splats=ObjectSplats(cloud=cloud, T_base_object=POSES[key]),
