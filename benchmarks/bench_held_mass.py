@@ -68,7 +68,7 @@ def one_trial(
         file, task, hidden, Streams(session, "standin"), rate_hz=0.0, seed=seed, start_ns=0
     )
     info = {"kind": "trial", "task": name, "stand_in": True}
-    about = {"id": f"{cell_name}_{seed}_{start}", "info": info}
+    about = {"id": f"{cell_name}_{seed + start}", "info": info}
     session.query("start", json.dumps(about).encode(), timeout_s=1.0)
     cell.announce()
     cell.reset(task.draw_start(np.random.default_rng(seed * SEEDS_PER_SESSION + start)))
