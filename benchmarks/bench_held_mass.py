@@ -53,6 +53,7 @@ def one_trial(
     name: str,
     mass_kg: float,
     friction: float | None = None,
+    start: int = 0,
 ) -> Any:
     """Record a trial of an object of this mass: episode, task, and whether it was lifted."""
     file, published = load_cell(cell_name), load_task(name)
@@ -67,14 +68,14 @@ def one_trial(
         file, task, hidden, Streams(session, "standin"), rate_hz=0.0, seed=seed, start_ns=0
     )
     info = {"kind": "trial", "task": name, "stand_in": True}
-    start = {"id": f"{cell_name}_{seed}", "info": info}
-    session.query("start", json.dumps(start).encode(), timeout_s=1.0)
+    about = {"id": f"{cell_name}_{seed + start}", "info": info}
+    session.query("start", json.dumps(about).encode(), timeout_s=1.0)
     cell.announce()
-    cell.reset(task.draw_start(np.random.default_rng(seed * SEEDS_PER_SESSION)))
+    cell.reset(task.draw_start(np.random.default_rng(seed * SEEDS_PER_SESSION + start)))
     cell.wait(LOOK_S)
     plan = plan_pick_and_place(
         task,
-        perceive(cell.world.Ts_base_object(), file.planner, start_seed=seed),
+        perceive(cell.world.Ts_base_object(), file.planner, start_seed=seed + start),
         NO_ERROR,
         kinematics=cell.kinematics,
         joints_start_rad=cell.home_rad,
@@ -88,9 +89,9 @@ def one_trial(
     execute_plan(cell, plan)
     ended = label_trial(cell.world.task, cell.truth, executed=True)
     session.query("stop", b'{"outcome": null, "discard": false}', timeout_s=1.0)
-    grasps = [stage for stage in ended.stages if stage["id"] == "grasp"]
-    lifted = all(stage["result"] == "success" for stage in grasps)
-    return Episode.open(folder / f"{start['id']}.mcap"), published, lifted
+    grasps = {stage["id"] for stage in task.stages if stage.get("grasp")}
+    lifted = all(stage["result"] == "success" for stage in ended.stages if stage["id"] in grasps)
+    return Episode.open(folder / f"{about['id']}.mcap"), published, lifted
 
 
 def with_bad_sensors(seed: int) -> Any:

@@ -24,7 +24,7 @@ from twin.scene.raster.rasteriser import NAMES, FitSession, RasterConfig, Raster
 VGA = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
 SMALL = Camera(width=160, height=120, fx=160.0, fy=160.0, cx=80.0, cy=60.0)
 COUNT = 50_000
-SMALL_COUNT = 2_000
+SMALL_COUNT, REPEATS = 2_000, 15
 TORCH_FACTOR, THREADS_FACTOR = 100.0, 1.8
 FRAME_MS = 200.0
 """CPU time that a frame of a whole episode may take."""
@@ -123,13 +123,7 @@ def with_threads(count: int, repeats: int) -> tuple[Target, dict[str, dict[str, 
     one, serial, stages_one = iterations(count, 1, repeats)
     two, _, stages_two = iterations(count, 2, repeats)
     share = serial / one
-    print(f"fit step, {count} Gaussians, 640 x 480, wall time [ms]")
-    print("  threads  " + "".join(f"{name:>9}" for name in stages_one) + "      all")
-    for threads, total, stages in ((1, one, stages_one), (2, two, stages_two)):
-        row = "".join(f"{seconds * 1e3:9.2f}" for seconds in stages.values())
-        print(f"  {threads:7d}  {row}{total * 1e3:9.2f}")
     bound = f"serial {100 * share:.1f} %: at most {2 / (1 + share):.2f} x by Amdahl's law"
-    print(f"  {bound}")
     target = Target(
         what=f"fit step, {count // 1000}k Gaussians, two threads faster than one",
         measured=one / two,
@@ -145,7 +139,7 @@ def of_a_sequence(repeats: int) -> Target:
     """A frame of ``render --episode``: background, two objects and eight links, put together."""
     links = {name: surface_cloud(SMALL, 1500) for name in LINKS}
     thing = ObjectSplats(cloud=surface_cloud(SMALL, 1500), T_base_object=np.eye(4))
-    seen = surface_cloud(VGA, COUNTS[0] - 3000)
+    seen = surface_cloud(VGA, COUNT - 3000)
     guessed = surface_cloud(VGA, 3000).as_completed()
     parts = MovableScene(
         background=concatenate([seen, guessed]),
@@ -172,11 +166,9 @@ def of_a_sequence(repeats: int) -> Target:
 
 
 def main() -> None:
-    """Measure; ``quick`` as the first argument takes fewer repeats."""
-    quick = "quick" in sys.argv[1:]
-    repeats = 5 if quick else 15
-    target, stages = with_threads(COUNT, repeats)
-    targets = [target, against_torch(repeats), of_a_sequence(repeats)]
+    """Measure."""
+    target, stages = with_threads(COUNT, REPEATS)
+    targets = [target, against_torch(REPEATS), of_a_sequence(REPEATS)]
     note = "640 x 480 unless said, forward and backward, CPU time of one thread unless said wall"
     report_targets("splat_rasteriser", targets, note=note, stages_s=stages)
 

@@ -28,11 +28,6 @@ class SoftNodes:
     points_m: Float[np.ndarray, "num_states num_nodes 3"]
     """At rest in the first state: as the replay began."""
 
-    @property
-    def rest_m(self) -> Float[np.ndarray, "num_nodes 3"]:
-        """The object unbent."""
-        return np.asarray(self.points_m[0])
-
     def at(self, stamp_ns: float) -> Float[np.ndarray, "num_nodes 3"]:
         """Interpolate between states; before the first and after the last it is that one."""
         place = float(np.interp(stamp_ns, self.stamps_ns, np.arange(len(self.stamps_ns))))
@@ -86,7 +81,7 @@ def bent(
     nodes = read_soft_nodes(replay, name)
     if nodes is None:
         return None
-    rest_m = nodes.rest_m
+    rest_m = nodes.points_m[0]
     num_nodes = len(rest_m)
     _, around = cKDTree(rest_m).query(rest_m, k=min(NUM_NEIGHBOURS + 1, num_nodes))
     count = int(np.clip(MAX_NODE_POSES // num_nodes, 2, len(own_ns)))

@@ -28,8 +28,6 @@ SAMPLE_COLUMN, SAMPLE_ROW = 0.0, 1.0
 """Where in its pixel the renderer looks, from the upper left corner [px]; seen in its images."""
 TABLE_M = 0.625
 SEED = 20
-FINER = 4
-"""How much finer the pictures are drawn that areas are averaged from."""
 LIGHT = {
     "lightDirection": [1.2, -0.9, 2.4],
     "lightColor": [1.0, 1.0, 1.0],
@@ -76,63 +74,6 @@ def load(folder: Path) -> CleanTabletop:
         images, depths = stored["images"], stored["depths"]
     frames = [frame_of(index, images[index], depths[index]) for index in range(NUM_VIEWS)]
     return CleanTabletop(train=frames[::2], held_out=frames[1::2])
-
-
-def load_areas(folder: Path) -> dict[str, list[np.ndarray]]:
-    """Read the held-out views averaged over areas, by their weights, or draw them (two minutes).
-
-    The renderer looks at one point of a pixel, and a scene of Gaussians draws areas. So this is
-    what a scene would draw that errs in nothing else.
-    """
-    name = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]
-    path = folder / f"clean_tabletop_areas.{name}.npz"
-    weights = {"a box of one pixel": box_weights(), "our low pass": gaussian_weights()}
-    if not path.is_file():
-        drawn: dict[str, list[np.ndarray]] = {about: [] for about in weights}
-        for index in range(1, NUM_VIEWS, 2):
-            fine = draw((index,), FINER)[0][0]
-            for about, taps in weights.items():
-                drawn[about].append(area_means(fine, taps))
-        np.savez(path, **{about: np.stack(images) for about, images in drawn.items()})
-    with np.load(path, allow_pickle=False) as stored:
-        return {about: list(stored[about]) for about in weights}
-
-
-def box_weights() -> np.ndarray:
-    """One pixel wide, for points 1 / FINER pixels apart: those at its two ends count half."""
-    weights = np.ones(FINER + 1)
-    weights[[0, -1]] = 0.5
-    return weights / weights.sum()
-
-
-def gaussian_weights() -> np.ndarray:
-    """Of the rasteriser's low pass, to four standard deviations."""
-    from twin.scene.raster.backend import MIP_VARIANCE_PX2
-
-    reach = int(np.ceil(4 * np.sqrt(MIP_VARIANCE_PX2) * FINER))
-    at_px = np.arange(-reach, reach + 1) / FINER
-    weights = np.exp(-0.5 * np.square(at_px) / MIP_VARIANCE_PX2)
-    return np.asarray(weights / weights.sum())
-
-
-def area_means(fine_u8: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Means around the points that a view of ordinary size shows, as 8-bit colour.
-
-    Args:
-        weights: Along rows and along columns, an odd number that adds up to 1.
-    """
-    reach = len(weights) // 2
-    padded = np.pad(fine_u8.astype(np.float32), ((reach,) * 2, (reach,) * 2, (0, 0)), mode="edge")
-    height, width = fine_u8.shape[:2]
-    # The point of a pixel of ordinary size, in fine pixels.
-    top, left = (round((FINER - 1) * at) for at in (SAMPLE_ROW, SAMPLE_COLUMN))
-    rows = sum(
-        weight * padded[top + k : top + k + height : FINER] for k, weight in enumerate(weights)
-    )
-    means = sum(
-        weight * rows[:, left + k : left + k + width : FINER] for k, weight in enumerate(weights)
-    )
-    return np.asarray(np.rint(np.clip(means, 0, 255)), dtype=np.uint8)
 
 
 def field_of_view_deg(index: int) -> float:
@@ -182,20 +123,15 @@ def frame_of(index: int, image_u8: np.ndarray, depth_m: np.ndarray) -> RgbdFrame
     )
 
 
-def draw(indices: Iterable[int], finer: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Colour (views x height x width x 3) and depth along the axis [m] of some views.
-
-    Args:
-        finer: How many times the ordinary width and height.
-    """
+def draw(indices: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (views x height x width x 3) and depth along the axis [m] of some views."""
     import pybullet
 
     client = pybullet.connect(pybullet.DIRECT)
     try:
         _build(pybullet)
         views = [
-            _draw_one(pybullet, camera_pose(index), field_of_view_deg(index), finer)
-            for index in indices
+            _draw_one(pybullet, camera_pose(index), field_of_view_deg(index)) for index in indices
         ]
     finally:
         pybullet.disconnect(client)
@@ -239,23 +175,22 @@ def _put(
 
 
 def _draw_one(
-    pybullet: ModuleType, T_base_camera: np.ndarray, field_of_view_deg: float, finer: int
+    pybullet: ModuleType, T_base_camera: np.ndarray, field_of_view_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
     to_gl = np.diag([1.0, -1.0, -1.0, 1.0]) @ se3.invert(T_base_camera)
     projection = pybullet.computeProjectionMatrixFOV(
         field_of_view_deg, WIDTH / HEIGHT, NEAR_M, FAR_M
     )
-    width, height = finer * WIDTH, finer * HEIGHT
     _, _, color, depth, _ = pybullet.getCameraImage(
-        width,
-        height,
+        WIDTH,
+        HEIGHT,
         viewMatrix=to_gl.T.ravel().tolist(),
         projectionMatrix=projection,
         renderer=pybullet.ER_TINY_RENDERER,
         **LIGHT,
     )
-    image = np.asarray(color, dtype=np.uint8).reshape(height, width, 4)[..., :3]
-    ratio = np.asarray(depth, dtype=np.float64).reshape(height, width)
+    image = np.asarray(color, dtype=np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3]
+    ratio = np.asarray(depth, dtype=np.float64).reshape(HEIGHT, WIDTH)
     depth_m = FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * ratio)
     depth_m[ratio >= 1.0] = 0.0
     return np.ascontiguousarray(image), depth_m.astype(np.float32)

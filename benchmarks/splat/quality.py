@@ -1,10 +1,7 @@
 """Rebuild from frames in memory and score held-out views."""
 
-import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -18,13 +15,6 @@ from twin.scene.settings import FitConfig, InitialiseConfig
 
 MAX_DEPTH_M = 5.0
 MAX_POINTS = 3_000_000
-
-
-def clock() -> tuple[Callable[[], float], str]:
-    """Wall time; GST_BENCH_CLOCK=cpu counts half the processor's seconds, on busy machines."""
-    if os.environ.get("GST_BENCH_CLOCK") == "cpu":
-        return (lambda: time.process_time() / 2), "half the CPU seconds of 2 threads"
-    return time.monotonic, "wall seconds"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,35 +40,31 @@ def rebuild(
     """Back-project, fuse and fit; the fit gets what the others leave of the budget."""
     from dataclasses import replace
 
-    seconds, _ = clock()
-    start = seconds()
+    start = time.monotonic()
     limits = DepthLimits(max_depth_m=MAX_DEPTH_M, flying_fraction=initialise.flying_fraction)
     surfaces = [FrameSurface(frame, limits) for frame in frames]
     pixels = len(frames) * frames[0].depth_m.size
     stride = max(1, round(float(np.sqrt(pixels / MAX_POINTS))))
     views = [training_view(surface) for surface in surfaces]
     first = fuse([surface.points(stride) for surface in surfaces], initialise.first_splats, views)
-    left = budget_s - (seconds() - start)
+    left = budget_s - (time.monotonic() - start)
     result = fit(
         first,
         views,
         replace(config, budget_s=left),
         lambda *_: None,
         max_splats=initialise.max_splats,
-        clock=seconds,
     )
-    return Rebuilt(first=first, result=result, seconds=seconds() - start)
+    return Rebuilt(first=first, result=result, seconds=time.monotonic() - start)
 
 
-def score(cloud: GaussianCloud, frames: list[RgbdFrame], *, pictures: Path | None = None) -> Scores:
+def score(cloud: GaussianCloud, frames: list[RgbdFrame]) -> Scores:
     """Draw held-out views from the poses given and compare, nothing aligned."""
     rasteriser = Rasteriser(RasterConfig())
     drawn = [
         rasteriser.view(cloud, frame.color_camera, frame.T_base_color).image_u8()
         for frame in frames
     ]
-    if pictures is not None:
-        save_pairs(pictures, frames, drawn)
     return compare(drawn, frames)
 
 
@@ -119,13 +105,3 @@ def compare(drawn: list[np.ndarray], frames: list[RgbdFrame]) -> Scores:
             )
         )
     return Scores(psnr_db=float(np.mean(values)), ssim=float(np.mean(similarities)))
-
-
-def save_pairs(folder: Path, frames: list[RgbdFrame], drawn: list[np.ndarray]) -> None:
-    """Recorded and drawn side by side, three of them, to look at."""
-    from PIL import Image
-
-    folder.mkdir(parents=True, exist_ok=True)
-    for index in range(0, len(frames), max(1, len(frames) // 3)):
-        pair = np.concatenate([frames[index].image_u8, drawn[index]], axis=1)
-        Image.fromarray(pair).save(folder / f"held_out_{index:02d}.png")

@@ -73,6 +73,7 @@ ROUNDS = 8  # fits, each with weights from the one before
 LEAST_ALIKE, MOST_ALIKE = 0.7, 1.4  # efforts, in parts of those described
 KNOWN_SHARE, KNOWN_KG = 0.2, 0.02  # a larger half interval is not determined; parts of the mass
 KNOWN_DRAG = 0.5  # the same of a push, in parts of it
+NOT_SEEN = "its stiffness is not determined by outlines or fingers; replays use the task file's"
 AGREE_SHARE = 0.99  # of trials of one object agree better
 
 Rows = Float[np.ndarray, "_ num_joints"]
@@ -391,10 +392,9 @@ def _looks(task: Task, key: str) -> ObjectModel:
 
 
 def unlike(task: Task, found: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Name objects of a task that look alike and do not weigh the same."""
-    notes = []
-    for one, other in combinations([key for key, item in found.items() if "value" in item], 2):
-        a, b = found[one], found[other]
+    """Name look-alikes of a task that do not weigh the same, and what nothing shows of toys."""
+    notes = [f"{key} of {task.name}: {NOT_SEEN}" for key in found if task.objects[key].soft]
+    for (one, a), (other, b) in combinations([x for x in found.items() if "value" in x[1]], 2):
         differ = max(a["low"], b["low"]) > min(a["high"], b["high"])
         if differ and _looks(task, one) == _looks(task, other):
             told = f"{a['value']:.3f} and {b['value']:.3f} kg: mixed up, so are their masses"

@@ -209,7 +209,7 @@ def test_trials_that_agree_are_as_sure_as_the_surest_and_others_are_named() -> N
     assert "0.300 kg in a, 0.050 kg in b" in swapped["why"]
 
 
-def test_objects_that_look_alike_and_differ_in_mass_are_named() -> None:
+def test_look_alikes_that_differ_in_mass_and_toys_of_unknown_stiffness_are_named() -> None:
     task = load_task("stack_two_cubes")
     first = task.manipulated[0]
     second = next(key for key in task.objects if key != first)
@@ -219,6 +219,8 @@ def test_objects_that_look_alike_and_differ_in_mass_are_named() -> None:
     assert not unlike(twins, {first: found[first], second: found[first]})
     red = replace(twins.objects[second], color_srgb=(1, 2, 3))
     assert not unlike(replace(twins, objects={**twins.objects, second: red}), found)
+    (note,) = unlike(load_task("sloth_into_basket"), {"sloth": found[first]})
+    assert note.startswith("sloth of sloth_into_basket: its stiffness is not determined")
 
 
 PUSHED_KG, RUBS, PUSH = 0.3, 0.25, "push_cube_to_mark"

@@ -92,8 +92,6 @@ def test_every_run_gives_the_same_bits(urdf: str, box_of_cells: Boxes) -> None:
 
 
 def test_poses_and_extents_at_rest_are_those_given(urdf: str) -> None:
-    from bridge.task.task_file import load_task
-
     duck = load_task("five_ducks_into_basket").objects["duck_1"]
     T = se3.transform_from(np.array([0.8, 0.0, 0.6, 0.0]), np.array([0.4, 0.1, 0.5]))
     with World(urdf, {}, PhysicsConfig()) as world:
