@@ -52,7 +52,7 @@ BLURRED = 0.78
 SAME_SURFACE = 0.03
 BRIGHTER = 0.14
 """Logarithm of the brightness of neighbours, from which exposure jumps."""
-APART_M, BEHIND_STAMP = 0.002, 12
+MOVED_M, BEHIND_STAMP = 0.002, 12
 """Images between which the camera moved or turned by this much differ, from this byte on."""
 FITS_AT_ALL = 0.6
 """Where less of the depth agrees, brightness of the same points says nothing."""
@@ -80,8 +80,8 @@ def check_colour(
     if len(chosen) < FEWEST or chosen[0].half.camera.width < LEAST_WIDTH_PX:
         return []
     same = [(a, b) for a, b in pairwise(sent) if a.data[BEHIND_STAMP:] == b.data[BEHIND_STAMP:]]
-    apart = [pose_at(a.publish_time_ns) - pose_at(b.publish_time_ns) for a, b in same]
-    copies = sum(float(np.abs(step).max()) > APART_M for step in apart)
+    steps = [pose_at(a.publish_time_ns) - pose_at(b.publish_time_ns) for a, b in same]
+    copies = sum(float(np.abs(step).max()) > MOVED_M for step in steps)
     return [*_edges(chosen, pose_at), *_blur(chosen), *_sequence(chosen, copies)]
 
 
