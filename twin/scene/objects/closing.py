@@ -4,7 +4,7 @@ What a fit leaves of an object is a ragged shell: open where nobody looked, mixe
 object and table touch. Here Gaussians are set evenly on the closed mesh. Each takes the colour it
 shows in the training views, away from the object's outline and from edges, where a camera that
 stands a few millimetres wrong sees something else. What no view shows takes the colour of the
-surface next to it that was seen, in the light that falls on it, and is marked as completed.
+surface next to it that was surely seen, in the light that falls on it, and is marked as completed.
 """
 
 from collections.abc import Sequence
@@ -46,6 +46,8 @@ EDGE_M, EDGE_COSINE = 0.006, 0.8
 NEAR_BEND, NEAR_OUTLINE = 1e-3, 1e-6
 """Weights of such pixels: they count where there are no others. Near an edge all colours are still
 the object's own, near its outline they may be the table's."""
+SURE = 0.1
+"""Weight of a colour that others may take: flat or near an outline, the table is mixed into it."""
 NEIGHBOURS = 24
 SIDEWAYS = 0.2
 """Share that a surface facing elsewhere has in the colour of a side that nobody saw."""
@@ -71,17 +73,16 @@ def closed_object(
         np.stack(rows) for rows in zip(*(look.at(p, normals) for look in looks), strict=True)
     )
     most = weights.max(axis=0)
-    is_seen, is_own = most > 0, most > NEAR_OUTLINE
-    if not is_seen.any():
+    if not most.any():
         return None
-    known = is_own if is_own.any() else is_seen
+    known, sure = (most > (bound if most.max() > bound else 0) for bound in (NEAR_OUTLINE, SURE))
     color = weighted_median(colors, weights)
     light = lighting.brightness(normals @ T_base_object[:3, :3].T)[:, None]
-    seen = p[known], normals[known], (color / light)[known]
+    seen = p[sure], normals[sure], (color / light)[sure]
     paint, _ = colors_around(p[~known], normals[~known], seen, NEIGHBOURS, sideways=SIDEWAYS)
     color[~known] = paint * light[~known]
     cloud = thin_gaussians(p, normals, color, spacing_m)
-    return replace(cloud, completed=~is_seen)
+    return replace(cloud, completed=most == 0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,7 +38,7 @@ from twin.scene.store.folder import (
     write_record,
 )
 
-METHOD_VERSION = 32
+METHOD_VERSION = 33
 """Counts changes of method that make older scenes out of date."""
 SEARCHED_SPLATS = 80_000
 """Points of the fused surface in which things are looked for, at most."""

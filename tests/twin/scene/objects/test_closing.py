@@ -156,6 +156,19 @@ def test_each_side_has_its_colour_and_nothing_of_the_table(closed: GaussianCloud
     assert lean < 8.0  # no channel leaves what the sides have
 
 
+def test_the_underside_takes_nothing_of_the_table_where_cameras_stand_too_high() -> None:
+    """All by 3 mm: below a side they see table."""
+    raised = se3.transform_from(np.array([1.0, 0, 0, 0]), np.array([0.0, 0.0, 0.003]))
+    seen = [view(T) for T in (*around(0.5, 9), *around(1.0, 5))]
+    off = [replace(each, T_base_color=raised @ each.T_base_color) for each in seen]
+    cloud = closed_object(cube(), off, T_BASE_CUBE)
+    assert cloud is not None
+    below = 255 * cloud.colors[cloud.means_m[:, 2] < -HALF_M + 1e-4]
+    upright = np.array([color for (axis, _), color in SIDES.items() if axis != 2])
+    away = np.abs(below[:, None] - upright).max(axis=-1).min(axis=1)
+    assert np.median(away) < 15.0  # some side's, or between two
+
+
 def test_the_underside_is_marked_and_has_the_colours_of_the_sides(closed: GaussianCloud) -> None:
     below = closed.means_m[:, 2] < -HALF_M + 1e-4
     assert closed.completed[below].mean() > 0.95
