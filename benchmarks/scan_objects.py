@@ -6,7 +6,6 @@ from itertools import product
 import numpy as np
 from localise_cell import Start, look_around
 from scipy.ndimage import binary_erosion
-from scipy.spatial import cKDTree
 
 from bridge.episode.streams import RgbdFrame
 from bridge.geometry import se3
@@ -161,7 +160,7 @@ class TurnedScore:
     """Mean colour over its pixels of a view against the recorded one, worst channel, 0..255; the
     median over views."""
     hidden_error: float
-    """Mean colour of what no view saw against that of the nearest surface that was seen."""
+    """Mean hue of what no view saw against that of the task file."""
 
 
 def score_turned(scan: Scanned, key: str) -> TurnedScore | None:
@@ -190,12 +189,10 @@ def score_turned(scan: Scanned, key: str) -> TurnedScore | None:
         drawn = rasteriser.view(placed, view.full.camera, view.T_base_color).image[shown]
         recorded = np.moveaxis(view.full.image(), 0, -1)[shown]
         errors.append(255 * float(np.abs((drawn - recorded).mean(axis=0)).max()))
-    hidden, seen = cloud.completed, np.flatnonzero(~cloud.completed)
-    error = 0.0
-    if hidden.any():
-        _, nearest = cKDTree(cloud.means_m[seen]).query(cloud.means_m[hidden])
-        apart = (cloud.colors[hidden] - cloud.colors[seen[nearest]]).mean(axis=0)
-        error = 255 * float(np.abs(apart).max())
+    error, true = 0.0, np.array(scan.start.task.objects[key].color_srgb)
+    if cloud.completed.any():  # as bright as they are: nobody says how light falls there
+        found = cloud.colors[cloud.completed].mean(axis=0)
+        error = float(np.abs(found * true.sum() / found.sum() - true).max())
     return TurnedScore(
         see_through=max(through), seen_error=float(np.median(errors)), hidden_error=error
     )
