@@ -26,6 +26,7 @@ from bridge.task.task_file import ObjectModel, Task, load_task
 from twin.physics.config import PhysicsConfig
 from twin.physics.soft import SoftModel
 from twin.physics.world import World
+from twin.replay.dynamics import mesh_hulls
 from twin.replay.path import JointPath, path_of_plan
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
@@ -158,11 +159,7 @@ def scene_lattice(mesh: str, size_m: tuple[float, float, float]) -> dict[str, np
 def furnished(trial: Trial) -> World:
     """The twin's world with the trial's objects."""
     hulls = hulls_of(load_robot(ROBOT.urdf_text()))
-    meshes: dict[str, list[np.ndarray]] = {}
-    for hull in hulls.hulls:
-        if hull.from_mesh:
-            meshes.setdefault(hull.link, []).append(hull.points_m)
-    world = World(hulls.robot.urdf, meshes, trial.physics)
+    world = World(hulls.robot.urdf, mesh_hulls(hulls), trial.physics)
     world.add_table(0.0)
     for key in trial.task.containers:
         world.add_static(trial.task.objects[key].panels(), trial.Ts_base_object[key])

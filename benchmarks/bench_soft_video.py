@@ -31,7 +31,6 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-import open3d
 from bench_held_mass import one_trial
 from measure import Target, report_targets
 
@@ -56,13 +55,15 @@ from twin.replay.scene import ReplayScene
 from twin.robot.collision import hulls_of
 from twin.robot.model import load_robot
 from twin.robot.posture import width_track
+from twin.scene.shape.mesh import first_hit
 
 CELL, TASK, TOY = load_cell("standin_toys"), load_task("sloth_into_basket"), "sloth"
 MODEL = TASK.objects[TOY]
 MESH, SOFT, FIRST_SEED = object_mesh(MODEL), MODEL.soft, 5_600_000
-GRID = [*((k, 1.0) for k in (0.25, 0.5, 1.0, 2.0, 4.0)), (1.0, 0.5), (1.0, 2.0)]
+STIFF = (0.25, 0.5, 1.0, 2.0, 4.0)
+GRID = [*((k, 1.0) for k in STIFF), (1.0, 0.5), (1.0, 2.0)]
 """Times the nominal stiffness, times the nominal friction of the toy."""
-LOGS = np.log([0.25, 0.5, 1.0, 2.0, 4.0])
+LOGS = np.log(STIFF)
 NOMINAL, RIGID, OWN, UP_M, PRESSES_M = 2, len(GRID), len(GRID) + 1, 0.05, 0.04
 MOMENTS = ("in the hand", "at rest")
 WAYS = ("one trial taught", "two taught", "the gripper taught", "nominal", "rigid", "own engine")
@@ -80,11 +81,8 @@ def true_skins(episode: Any) -> dict[int, np.ndarray]:
 
 def mask(camera: Any, T: np.ndarray, skin_m: np.ndarray) -> np.ndarray:
     """Which pixels a surface covers."""
-    scene, tensor = open3d.t.geometry.RaycastingScene(nthreads=1), open3d.core.Tensor
-    scene.add_triangles(tensor(skin_m.astype("f4")), tensor(MESH.triangles.astype("u4")))
-    ways = camera.rays().reshape(-1, 3) @ T[:3, :3].T
-    rays = np.concatenate([np.broadcast_to(T[:3, 3], ways.shape), ways], axis=1)
-    return np.isfinite(scene.cast_rays(tensor(rays.astype("f4")), nthreads=1)["t_hit"].numpy())
+    depth_m, _ = first_hit(camera.rays(), T, {TOY: (skin_m, MESH.triangles)}, {TOY: np.eye(4)})
+    return np.isfinite(depth_m).ravel()
 
 
 def own_engine(path: Any, seen: Any, hidden: Any, at_ns: np.ndarray) -> list[np.ndarray]:
@@ -153,7 +151,7 @@ def measured(folder: Path, seed: int, start: int) -> dict[str, Any] | None:
         rigid.append([se3.apply(T, MESH.vertices_m) for T in states.Ts_base_object[TOY][rows]])
     skins += [rigid[NOMINAL], own_engine(path, seen, hidden, at_ns - start_ns)]
     stopped_m = float(np.interp(at_ns[1], widths.stamps_ns, widths.position[:, 0]))
-    curve = np.maximum.accumulate(stops_m[:5]), LOGS
+    curve = np.maximum.accumulate(stops_m[: len(STIFF)]), LOGS
     return {
         "seed": seed, "start": start, "hidden": hidden.stiffness_scale, "stopped_m": stopped_m,
         "stops_m": stops_m, "gripper_log": float(np.interp(stopped_m, *curve)),
@@ -187,7 +185,9 @@ def main() -> None:
         table[f"{way}, {kind}, {moment}, {camera}"] = [float(np.median(iou)), min(iou)]
     for camera in CELL.cameras:
         reached, *ends = (table[f"{WAYS[w]}, iou, at rest, {camera}"][0] for w in (0, 3, 4))
-        for what, limit in zip(("0.85", "the nominal toy's", "the rigid toy's"), (0.85, *ends)):  # noqa: B905
+        for what, limit in zip(
+            ("0.85", "the nominal toy's", "the rigid toy's"), (0.85, *ends), strict=True
+        ):
             name = f"at rest, {camera}, median IoU against {what}"
             targets.append(Target(what=name, measured=reached, limit=limit, at_most=False))
     said = [(rows[0]["hidden"], [GRID[best([row])][0] for row in rows]) for rows in labs if rows]

@@ -40,10 +40,10 @@ class GateConfig:
     """Plans that may wait while one is judged; more are turned away at once."""
     samples: int = 32
     """Varied replays behind each verdict, for its success probability: as many of them as fit into
-    --max-steps, and none once they decide whether more than --min-p-success succeed (0: half)."""
+    --max-steps, and none once they decide about --min-p-success (0: whether half succeed)."""
     min_p_success: float = 0.0
-    """Refuse a plan that the nominal replay accepts when fewer of its samples succeed, as a
-    fraction; 0 leaves the nominal replay alone to decide."""
+    """Refuse a plan that the nominal replay accepts when its p_success is less: without trials of
+    the cell that is 0.65 at most. 0 leaves the nominal replay alone to decide."""
     frame_wait_s: Annotated[float, RARE] = 10.0
     """Wait this long for fresh frames before giving up."""
     replay: Annotated[ReplayConfig, Parameter(name="replay"), RARE] = field(

@@ -174,8 +174,7 @@ def _while_near(
         return at_end
     if len(new) and new[-1] > old[0]:
         return replace(at_end, start_ns=stamps[old[0]], end_ns=stamps[new[-1]])
-    way_m, left_ns = float(np.linalg.norm(after[:3, 3] - T[:3, 3])), stamps[old[-1]]
-    alone_ns = round(1e9 * TIPS * np.sqrt(2 * way_m / GRAVITY_M_S2))
+    left_ns, alone_ns = stamps[old[-1]], round(TIPS * _fall_ns(after[:3, 3] - T[:3, 3]))
     return replace(at_end, start_ns=left_ns, end_ns=left_ns + alone_ns)
 
 
@@ -257,14 +256,19 @@ def _moved(
     return [replace(rest, T_end=after), _rest(rest.end_ns, after)], note
 
 
+def _fall_ns(way_m: Float[np.ndarray, "3"]) -> float:
+    """How long a free fall takes over a distance."""
+    return 1e9 * float(np.sqrt(2 * np.linalg.norm(way_m) / GRAVITY_M_S2))
+
+
 def _fallen(
     start_ns: int, T_start: Float[np.ndarray, "4 4"], T_end: Float[np.ndarray, "4 4"]
 ) -> list[_Span]:
     """From one place to another, as long as a free fall takes over that distance, or tipping."""
     way_m = T_start[:3, 3] - T_end[:3, 3]
-    fall_s = np.sqrt(2 * np.linalg.norm(way_m) / GRAVITY_M_S2)
+    fall_ns = _fall_ns(way_m)
     if np.linalg.norm(way_m[:2]) > FELL_M / 2:
-        fall_s *= TIPS
-    end_ns = start_ns + round(1e9 * float(fall_s))
+        fall_ns *= TIPS
+    end_ns = start_ns + round(fall_ns)
     fall = _Span(start_ns=start_ns, end_ns=end_ns, T_start=T_start, T_end=T_end, power=2)
     return [fall, _rest(end_ns, T_end)]

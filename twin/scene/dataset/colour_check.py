@@ -79,8 +79,11 @@ def check_colour(
     chosen = [views[k] for k in spread(np.arange(len(views)), MAX_VIEWS)]
     if len(chosen) < FEWEST or chosen[0].half.camera.width < LEAST_WIDTH_PX:
         return []
-    same = [(a, b) for a, b in pairwise(sent) if a.data[BEHIND_STAMP:] == b.data[BEHIND_STAMP:]]
-    steps = [pose_at(a.publish_time_ns) - pose_at(b.publish_time_ns) for a, b in same]
+    steps = (  # one after the other: images are large, and many
+        pose_at(a.publish_time_ns) - pose_at(b.publish_time_ns)
+        for a, b in pairwise(sent)
+        if a.data[BEHIND_STAMP:] == b.data[BEHIND_STAMP:]
+    )
     copies = sum(float(np.abs(step).max()) > MOVED_M for step in steps)
     return [*_edges(chosen, pose_at), *_blur(chosen), *_sequence(chosen, copies)]
 
@@ -106,9 +109,8 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
             return [f"its colour images are {word} to its depth"]
     flows = np.array([_flow_px_s(view, pose_at) for view in views])
     late = np.stack([*map(_meeting, edges, jumps, flows[:, None] * DELAYS_S[:, None])])
-    best, *parts = (int(part.mean(axis=0).argmax()) for part in (late, late[::2], late[1::2]))
+    best, delay_s, differ_s = _best_of(late, DELAYS_S)
     gain = late[:, best] - late[:, len(DELAYS_S) // 2]
-    delay_s, differ_s = float(DELAYS_S[best]), abs(float(np.diff(DELAYS_S[parts])[0]))
     sure = abs(delay_s) >= LATE_S and differ_s * np.median(np.hypot(*flows.T)) <= SAME_PEAK_PX
     sure &= gain.mean() > SURE * gain.std() / np.sqrt(len(gain))
     if sure and late[some, best].mean() > maps.max():
@@ -116,8 +118,8 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
         return [f"its colour was taken {1e3 * abs(delay_s):.0f} ms {word} than its depth"]
     here = LEAST_GAIN * float(maps[np.abs(GRID_PX).max(axis=1) <= 1].max())
     sized = np.stack([_sized(edges[k], jumps[k]) for k in some])
-    best, *parts = (int(part.mean(axis=0).argmax()) for part in (sized, sized[::2], sized[1::2]))
-    larger, differ = float(SCALES[best]) - 1.0, abs(float(np.diff(SCALES[parts])[0]))
+    best, scale, differ = _best_of(sized, SCALES)
+    larger = scale - 1.0
     if abs(larger) >= LEAST_SCALE and differ <= SAME_SCALE and sized[:, best].mean() > here:
         word = f"{100 * abs(larger):.0f} % {'larger' if larger > 0 else 'smaller'}"
         return [f"its colour is {word} than its depth has it: a wrong focal length"]
@@ -128,6 +130,12 @@ def _edges(views: Sequence[TrainingView], pose_at: PoseAt) -> list[str]:
             "how the two were registered"
         ]
     return []
+
+
+def _best_of(each: np.ndarray, values: np.ndarray) -> tuple[int, float, float]:
+    """Where the mean of views' curves is highest, the value there, and how far halves differ."""
+    best, *parts = (int(part.mean(axis=0).argmax()) for part in (each, each[::2], each[1::2]))
+    return best, float(values[best]), abs(float(np.diff(values[parts])[0]))
 
 
 def _is_sure(each: np.ndarray) -> bool:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from bridge.episode import streams
 from bridge.geometry import se3
 from twin.errors import TwinError
-from twin.scene.dataset.scan_check import CLEARLY_BETTER, CameraCheck, ScanReport
+from twin.scene.dataset.scan_check import CameraCheck, ScanReport
 from twin.scene.frames.downscaled import DownscaledDepth, pixels_of, thinned_camera
 from twin.scene.frames.pairing import paired_stamps_ns
 from twin.scene.frames.selection import FrameChoice, spread
@@ -45,6 +45,8 @@ ENOUGH = 0.9
 """With this agreement nothing is looked for."""
 LEAST_GAIN = 0.01
 """A number is wrong when this much more of the depth agrees with another."""
+CLEARLY_BETTER = 0.2
+"""It is refused when this much more agrees."""
 LEAST_AGREEMENT = 0.35
 """With less agreement even at the best, one number does not explain it."""
 SMALLEST = {"depth": 0.03, "focal": 0.03, "delay": 0.6}

@@ -72,7 +72,8 @@ OTHER_POSES = tuple(
 
 GOOD = 0.5
 """With this share of the overlap agreeing, poses and depth belong together."""
-BETTER, CLEARLY_BETTER = 0.12, 0.2
+BETTER = 0.12
+"""Another reading must let so much more of the depth agree."""
 MIN_OVERLAP = 0.05
 """With less, depth says nothing about the poses."""
 SOLID_OVERLAP = 0.2
